@@ -1,0 +1,1 @@
+"""Rotations, cameras, Eq. 1, distortion and rectification, calibration."""

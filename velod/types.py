@@ -1,0 +1,215 @@
+"""The arrays that flow: what each message holds, with dtype, shape, unit and frame.
+
+Conventions (all messages):
+
+* ``seq`` counts the messages of one publisher from 0; a value lower than the one before means that the
+  publisher was restarted.
+* ``t_ns`` is sensor time in integer nanoseconds; what it marks is said for each message.
+* Columns are contiguous numpy arrays of one length ``n`` in the first axis.
+* ``x`` is the column and ``y`` the row of a pixel; pixel centres are at integers.
+* An *age* is ``batch.t_ns - event time`` in ns, at least 1; 0 means "no event within the memory".
+
+Frames: ``B`` body = IMU; ``C`` = the *rectified* left camera (x right, y down, z forward); ``W`` world, z up.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+U8 = NDArray[np.uint8]
+U16 = NDArray[np.uint16]
+U32 = NDArray[np.uint32]
+I64 = NDArray[np.int64]
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+NS_PER_S = 1_000_000_000
+PATCH = 5
+"""Side of the neighbourhood of the plane fit, in pixels (Sec. V-A: 5 x 5)."""
+
+
+@dataclass(frozen=True, slots=True)
+class EventPacket:
+    """Raw events of one camera, as a driver publishes them, in sensor pixels.
+
+    ``t_ns`` is a watermark: every event of this camera earlier than it has been sent in this packet or an
+    earlier one, and later packets hold only events at ``t_ns`` or later. It is at least the time of the last
+    event. A packet without events is allowed, and moves the watermark alone (a static scene).
+    """
+
+    seq: int
+    t_ns: int
+    camera: str  # "left" | "right"
+    x: U16  # (n,) column, px
+    y: U16  # (n,) row, px
+    event_t_ns: I64  # (n,) sensor time, non-decreasing
+    p: U8  # (n,) polarity, 1 = ON, 0 = OFF
+
+
+@dataclass(frozen=True, slots=True)
+class ImuPacket:
+    """IMU samples as a driver publishes them; ``t_ns`` is the time of the last sample."""
+
+    seq: int
+    t_ns: int
+    sample_t_ns: I64  # (n,) sensor time, increasing
+    accel: F64  # (n, 3) specific force, m/s^2, frame B (+9.81 upwards at rest)
+    gyro: F64  # (n, 3) angular velocity, rad/s, frame B
+
+
+@dataclass(frozen=True, slots=True)
+class EventBatch:
+    """Selected left events with their neighbourhoods on the surface of active events: ingest -> flow.
+
+    The batch holds the left events with ``t_start_ns <= t < t_ns``; ``t_ns`` is its (exclusive) end.
+    """
+
+    seq: int
+    t_ns: int
+    t_start_ns: int
+    n_events: int  # left events in the batch before selection
+    x: U16  # (n,) sensor px, left camera
+    y: U16  # (n,) sensor px
+    age: U32  # (n,) ns before t_ns, >= 1
+    p: U8  # (n,) 1 = ON, 0 = OFF
+    patch: U32  # (n, 25) ages (ns) of the 5x5 same-polarity neighbours, row-major, 0 = none
+
+
+@dataclass(frozen=True, slots=True)
+class StereoBatch:
+    """The same selected events with the surfaces of both cameras at the batch's end: ingest -> depth.
+
+    A surface cell is an age in steps of ``unit_ns`` (1 .. 65535), 0 where nothing happened within the memory.
+    """
+
+    seq: int
+    t_ns: int
+    t_start_ns: int
+    unit_ns: int
+    x: U16  # (n,) as in the EventBatch of the same seq
+    y: U16  # (n,)
+    age: U32  # (n,) ns
+    p: U8  # (n,)
+    left: U16  # (2, h, w) first-of-burst SAE per polarity (0 = OFF, 1 = ON), left sensor grid
+    right: U16  # (2, h, w) right sensor grid
+    left_last: U16  # (h, w) last event of either polarity, left
+    right_last: U16  # (h, w) right
+
+
+@dataclass(frozen=True, slots=True)
+class FlowBatch:
+    """Normal flow at selected events: flow -> optimizer. Positions and flow on the rectified left image."""
+
+    seq: int
+    t_ns: int  # end of the batch
+    n_selected: int  # events in the EventBatch; the culled ones are missing below
+    index: U16  # (m,) position in the EventBatch, increasing
+    age: U32  # (m,) ns before t_ns
+    x: F32  # (m,) rectified px
+    y: F32  # (m,) rectified px
+    n: F32  # (m, 2) unit vector along the normal flow (direction of motion of the edge)
+    speed: F32  # (m,) normal flow, px/s, > 0
+    sigma: F32  # (m,) standard deviation of speed, px/s
+
+
+@dataclass(frozen=True, slots=True)
+class DepthBatch:
+    """Inverse depth at selected events: depth -> optimizer."""
+
+    seq: int
+    t_ns: int
+    n_selected: int
+    index: U16  # (m,) position in the batch, increasing
+    disparity: F32  # (m,) px on the rectified images
+    inv_depth: F32  # (m,) 1/Z, 1/m, frame C
+    sigma: F32  # (m,) standard deviation of inv_depth, 1/m
+    refined: U8  # (m,) 1 = plane coincidence, 0 = block matching only
+
+
+@dataclass(frozen=True, slots=True)
+class ImuSamples:
+    """Checked and ordered IMU samples, and how far the events have been batched: ingest -> optimizer.
+
+    Every batch with ``t_ns <= event_t_ns`` has been sent; ``batch_seq`` is the last of them (-1: none yet) and
+    ``batch_t_ns`` its end. The optimizer waits for those and for no others, so its result does not depend on
+    the order in which messages arrive.
+    """
+
+    seq: int
+    t_ns: int  # time of the last sample (here or in an earlier message), 0 before the first
+    event_t_ns: int
+    batch_seq: int
+    batch_t_ns: int
+    sample_t_ns: I64  # (n,) camera clock (T_imu-camera offset already applied), increasing; n may be 0
+    accel: F64  # (n, 3) m/s^2, frame B
+    gyro: F64  # (n, 3) rad/s, frame B
+
+
+class TrackingState(StrEnum):
+    """What the optimizer says of its own estimate."""
+
+    INITIALISING = "initialising"
+    TRACKING = "tracking"
+    DEGRADED = "degraded"
+    LOST = "lost"
+
+
+@dataclass(frozen=True, slots=True)
+class Velocity:
+    """The product: linear velocity of the origin of B (the IMU), expressed in B."""
+
+    seq: int
+    t_ns: int  # sensor time of the estimate
+    v_B: F64  # (3,) m/s
+    cov: F64  # (3, 3) covariance of v_B, (m/s)^2
+    valid: bool
+    state: str  # a TrackingState
+    reason: str  # why not tracking; "" while tracking
+    batch_seq: int  # newest batch that went into it, -1: none
+    batch_t_ns: int  # its end; t_ns - batch_t_ns was bridged by the IMU
+
+
+@dataclass(frozen=True, slots=True)
+class Health:
+    """State of one process, published at 1 Hz."""
+
+    seq: int
+    t_ns: int  # newest sensor time seen, 0: none yet
+    stage: str  # "ingest" | "flow" | "depth" | "optimizer" | "supervisor" | a driver's name
+    worker: str  # e.g. "flow-0"
+    pid: int
+    host: str
+    version: str
+    uptime_s: float
+    counters: dict[str, int] = field(default_factory=dict)  # since start: drops by cause, messages, gaps, ...
+    rates: dict[str, float] = field(default_factory=dict)  # per second, over the last period
+    latency_ms: dict[str, float] = field(default_factory=dict)  # p50/p99 over the last period
+    alarms: dict[str, str] = field(default_factory=dict)  # name -> what is wrong, while it is
+
+
+@dataclass(frozen=True, slots=True)
+class Done:
+    """A worker has finished a batch (whatever came out of it): worker -> dispatcher."""
+
+    seq: int  # of the batch
+    t_ns: int  # of the batch
+    stage: str
+    worker: str
+
+
+Message = (
+    EventPacket
+    | ImuPacket
+    | EventBatch
+    | StereoBatch
+    | FlowBatch
+    | DepthBatch
+    | ImuSamples
+    | Velocity
+    | Health
+    | Done
+)
