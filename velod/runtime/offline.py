@@ -1,0 +1,47 @@
+"""The four stages chained in one process: the same bits as the processes, without them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+from velod.config import Settings
+from velod.geometry.calibration import Calibration
+from velod.runtime.stages import STAGES, create_stage
+from velod.types import EventBatch, EventPacket, ImuPacket, Message, StereoBatch, Velocity
+
+
+def run_offline(
+    settings: Settings,
+    calibration: Calibration,
+    packets: Iterable[EventPacket | ImuPacket],
+    on_message: Callable[[Message], None] | None = None,
+    counters: dict[str, dict[str, int]] | None = None,
+) -> list[Velocity]:
+    """Every velocity that the packets lead to, in order.
+
+    ``on_message`` is called with each message that a stage puts out, before the next stage sees it. ``counters``
+    is filled with the counters of each stage by name.
+    """
+    stages = {name: create_stage(name, settings, calibration) for name in STAGES}
+    # What a message leads to is handled before the message's successor: the order of one ideal network.
+    route = {EventBatch: stages["flow"], StereoBatch: stages["depth"]}
+    velocities: list[Velocity] = []
+    for packet in packets:
+        for selected in stages["ingest"].handle(packet):
+            _note(selected, on_message)
+            worker = route.get(type(selected))
+            for estimate in [selected] if worker is None else worker.handle(selected):
+                if worker is not None:
+                    _note(estimate, on_message)
+                for velocity in stages["optimizer"].handle(estimate):
+                    _note(velocity, on_message)
+                    if isinstance(velocity, Velocity):
+                        velocities.append(velocity)
+    if counters is not None:
+        counters.update({name: dict(stage.counters) for name, stage in stages.items()})
+    return velocities
+
+
+def _note(message: Message, on_message: Callable[[Message], None] | None) -> None:
+    if on_message is not None:
+        on_message(message)

@@ -1,0 +1,63 @@
+"""What the runtime knows of a stage: its name, its class, and ``handle``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+from velod.config import Settings
+from velod.geometry.calibration import Calibration
+from velod.types import Message
+
+STAGES = ("ingest", "flow", "depth", "optimizer")
+
+
+class Stage(Protocol):
+    """A stage does no input or output of its own: messages in, messages out."""
+
+    counters: dict[str, int]
+
+    def handle(self, message: Any, /) -> Sequence[Message]:
+        """What follows from one message, in the order in which it is to be published."""
+        ...
+
+
+def create_stage(name: str, settings: Settings, calibration: Calibration) -> Stage:
+    """The stage of this name, one of STAGES. Imports it only now, so that a worker loads no other stage's code."""
+    if name == "ingest":
+        from velod.ingest.stage import IngestStage
+
+        return IngestStage(settings, calibration)
+    if name == "flow":
+        from velod.flow.stage import FlowStage
+
+        return FlowStage(settings, calibration)
+    if name == "depth":
+        from velod.depth.stage import DepthStage
+
+        return DepthStage(settings, calibration)
+    if name == "optimizer":
+        from velod.optimizer.stage import OptimizerStage
+
+        return OptimizerStage(settings, calibration)
+    raise ValueError(f"no stage {name!r}; stages: {', '.join(STAGES)}")
+
+
+def alarms_of(stage: Stage) -> dict[str, str]:
+    """The alarms of a stage that has any."""
+    alarms: dict[str, str] = getattr(stage, "alarms", {})
+    return dict(alarms)
+
+
+def worker_names(settings: Settings, stage: str) -> list[str]:
+    """The workers of one stage: ``flow-0``, ``flow-1``, ..."""
+    count = {"flow": settings.flow.workers, "depth": settings.depth.workers}.get(stage, 1)
+    return [f"{stage}-{i}" for i in range(count)]
+
+
+def stage_of(worker: str) -> str:
+    """The stage of a worker's name. Raises ValueError for a name that is not ``<stage>-<number>``."""
+    stage, _, number = worker.rpartition("-")
+    if stage not in STAGES or not number.isdecimal():
+        raise ValueError(f"worker {worker!r}: must be <stage>-<number>, such as flow-0; stages: {', '.join(STAGES)}")
+    return stage
