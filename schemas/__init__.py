@@ -1,0 +1,1 @@
+"""The contract for other languages, as data; read through ``velod.wire.schema``."""

@@ -1,0 +1,313 @@
+"""Messages to bytes and back: a msgpack map whose arrays are columns of raw little-endian bytes.
+
+What is sent and what is checked is said by the schemas (``velod.wire.schema``), not here. Whatever ``decode`` is
+given, it returns a message that keeps its schema's promises or raises WireError.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import msgpack
+import numpy as np
+from numpy.typing import NDArray
+
+from velod.types import Message
+from velod.wire.schema import MESSAGE_TYPES, VERSION, Field, Schema, WireError, schema
+
+MAX_BYTES = 64 << 20
+"""Largest message. A 1280x720 StereoBatch has 11 MB, a second of 5 Mev/s has 45 MB."""
+
+_MAX_STR = 1 << 16
+_MAX_MAP = 1024
+_INT64 = (-(2**63), 2**63 - 1)
+_U32 = np.dtype("<u4")
+
+
+@dataclass(frozen=True, slots=True)
+class Envelope:
+    """A decoded message with the two host times it travelled with (ns since 1970)."""
+
+    message: Message
+    t_pub_ns: int
+    t_origin_ns: int  # when the batch that the message derives from was closed; 0: none
+
+
+def encode(message: Message, t_pub_ns: int, t_origin_ns: int = 0) -> bytes:
+    """The bytes of a message. Raises WireError where it does not fit its schema (dtype, shape, span)."""
+    name = type(message).__name__
+    s = schema(name)
+    tree: dict[str, Any] = {"schema": s.name, "v": VERSION, "t_pub_ns": t_pub_ns, "t_origin_ns": t_origin_ns}
+    sizes: dict[str, int] = {}
+    for f in s.fields:
+        _WRITE[f.kind](s, f, getattr(message, f.name), tree, sizes)
+    for dim in s.dims.values():
+        if sizes[dim.name] > dim.max:
+            raise WireError("wire.too_large", f"{name}: {dim.name} = {sizes[dim.name]}, the limit is {dim.max}")
+        if dim.sent:
+            tree[dim.name] = sizes[dim.name]
+    data: bytes = msgpack.packb(tree)
+    if len(data) > MAX_BYTES:
+        raise WireError("wire.too_large", f"{name}: {len(data)} bytes, the limit is {MAX_BYTES}")
+    return data
+
+
+def decode(data: bytes | bytearray | memoryview, expect: type[Any] | None = None) -> Envelope:
+    """The message in ``data``; with ``expect``, only a message of that type. Raises WireError, and nothing else.
+
+    Arrays are aligned, writable copies, so that a compiled kernel sees one kind of array wherever it comes from.
+    """
+    tree = _unpack(data)
+    s = _schema_of(tree, expect)
+    sizes = _sizes(s, tree)
+    values = {f.name: _READ[f.kind](s, f, tree, sizes) for f in s.fields}
+    for f in s.fields:
+        if f.kind == "column":
+            _check_column(s, f, values)
+        elif f.not_after and values[f.name] > values[f.not_after]:
+            raise WireError("wire.time_backwards", f"{s.name}: {f.name} is after {f.not_after}")
+    head = schema("Envelope")
+    tree.setdefault("t_origin_ns", 0)
+    times = {f.name: _read_int(s, f, tree, sizes) for f in head.fields if f.name.startswith("t_")}
+    message = MESSAGE_TYPES[s.name.removeprefix("velod.")](**values)
+    return Envelope(message=message, **times)
+
+
+def _unpack(data: bytes | bytearray | memoryview) -> dict[str, Any]:
+    if len(data) > MAX_BYTES:
+        raise WireError("wire.too_large", f"{len(data)} bytes, the limit is {MAX_BYTES}")
+    try:
+        tree = msgpack.unpackb(
+            data, max_str_len=_MAX_STR, max_map_len=_MAX_MAP, max_bin_len=len(data), max_array_len=0, max_ext_len=0
+        )
+    except msgpack.ExtraData:
+        raise WireError("wire.not_msgpack", "bytes after the end of the message") from None
+    except (ValueError, TypeError, RecursionError) as e:
+        # msgpack says "incomplete input" for a message that was cut off, and leaves everything else to the text.
+        reason = "wire.truncated" if "incomplete input" in str(e) else "wire.not_msgpack"
+        raise WireError(reason, f"{len(data)} bytes: {e}") from None
+    if not isinstance(tree, dict):
+        raise WireError("wire.not_map", f"a msgpack {type(tree).__name__} instead of a map")
+    return tree
+
+
+def _schema_of(tree: dict[str, Any], expect: type[Any] | None) -> Schema:
+    full = tree.get("schema")
+    name = full.removeprefix("velod.") if isinstance(full, str) else ""
+    if name not in MESSAGE_TYPES or full != f"velod.{name}":
+        raise WireError("wire.schema_unknown", f"schema {_short(full)}")
+    if type(tree.get("v")) is not int or tree["v"] != VERSION:
+        raise WireError("wire.version_alien", f"{full}: version {_short(tree.get('v'))}, this velod reads {VERSION}")
+    if expect is not None and name != expect.__name__:
+        raise WireError("wire.schema_unexpected", f"{full} where velod.{expect.__name__} belongs")
+    return schema(name)
+
+
+def _short(value: Any) -> str:
+    return repr(value)[:80]
+
+
+# --- sizes ---
+
+
+def _sizes(s: Schema, tree: dict[str, Any]) -> dict[str, int]:
+    """Every dim of a received message: scalars that were sent, and the rows of the longest column."""
+    sizes: dict[str, int] = {}
+    for dim in s.dims.values():
+        sizes[dim.name] = _sent_size(s, dim.name, tree) if dim.sent else 0
+    for f in s.fields:
+        if f.shape and isinstance(f.shape[0], str) and not s.dims[f.shape[0]].sent:
+            row = _row_bytes(f)
+            sizes[f.shape[0]] = max(sizes[f.shape[0]], -(-len(_bin(s, f, tree)) // row))
+    for dim in s.dims.values():
+        if sizes[dim.name] > dim.max:
+            raise WireError("wire.too_large", f"{s.name}: {dim.name} = {sizes[dim.name]}, the limit is {dim.max}")
+    return sizes
+
+
+def _sent_size(s: Schema, name: str, tree: dict[str, Any]) -> int:
+    return _read_int(s, Field(name, "int", min=0), tree, {})
+
+
+def _row_bytes(f: Field) -> int:
+    dtype = f.dtype or _U32
+    count = 1
+    for part in f.shape[1:]:
+        if isinstance(part, int):
+            count *= part
+    return dtype.itemsize * count
+
+
+def _bin(s: Schema, f: Field, tree: dict[str, Any]) -> bytes:
+    name = f.offsets or f.name
+    data = _get(s, name, tree)
+    if type(data) is not bytes:
+        raise WireError("wire.field_type", f"{s.name}: {name} must be bin, got {type(data).__name__}")
+    return data
+
+
+def _get(s: Schema, name: str, tree: dict[str, Any]) -> Any:
+    try:
+        return tree[name]
+    except KeyError:
+        raise WireError("wire.field_missing", f"{s.name}: {name}") from None
+
+
+# --- reading ---
+
+
+def _read_int(s: Schema, f: Field, tree: dict[str, Any], sizes: dict[str, int]) -> int:
+    value = _get(s, f.name, tree)
+    if type(value) is not int:
+        raise WireError("wire.field_type", f"{s.name}: {f.name} must be an integer, got {type(value).__name__}")
+    lo = _INT64[0] if f.min is None else f.min
+    hi = _INT64[1] if f.max is None else f.max
+    if not lo <= value <= hi:
+        raise WireError("wire.bounds", f"{s.name}: {f.name} = {value}, allowed {lo} .. {hi}")
+    return value
+
+
+def _read_float(s: Schema, f: Field, tree: dict[str, Any], sizes: dict[str, int]) -> float:
+    value = _get(s, f.name, tree)
+    if type(value) not in (int, float):
+        raise WireError("wire.field_type", f"{s.name}: {f.name} must be a number, got {type(value).__name__}")
+    return float(value)
+
+
+def _read_bool(s: Schema, f: Field, tree: dict[str, Any], sizes: dict[str, int]) -> bool:
+    value = _get(s, f.name, tree)
+    if type(value) is not bool:
+        raise WireError("wire.field_type", f"{s.name}: {f.name} must be a boolean, got {type(value).__name__}")
+    return value
+
+
+def _read_str(s: Schema, f: Field, tree: dict[str, Any], sizes: dict[str, int]) -> str:
+    value = _get(s, f.name, tree)
+    if type(value) is not str:
+        raise WireError("wire.field_type", f"{s.name}: {f.name} must be a string, got {type(value).__name__}")
+    if f.choices and value not in f.choices:
+        raise WireError("wire.bounds", f"{s.name}: {f.name} = {_short(value)}, allowed {', '.join(f.choices)}")
+    return value
+
+
+_MAP_TYPES: dict[str, tuple[type, ...]] = {"int": (int,), "float": (int, float), "str": (str,)}
+
+
+def _read_map(s: Schema, f: Field, tree: dict[str, Any], sizes: dict[str, int]) -> dict[str, Any]:
+    value = _get(s, f.name, tree)
+    allowed = _MAP_TYPES[f.values]
+    if type(value) is not dict or not all(type(k) is str and type(v) in allowed for k, v in value.items()):
+        raise WireError("wire.field_type", f"{s.name}: {f.name} must be a map from string to {f.values}")
+    return {k: float(v) for k, v in value.items()} if f.values == "float" else value
+
+
+def _read_column(s: Schema, f: Field, tree: dict[str, Any], sizes: dict[str, int]) -> NDArray[Any]:
+    assert f.dtype is not None
+    data = _bin(s, f, tree)
+    shape = tuple(part if isinstance(part, int) else sizes[part] for part in f.shape)
+    _check_length(s, f, len(data), int(np.prod(shape, dtype=np.int64)) * f.dtype.itemsize)
+    # A copy, because a view of the received bytes is read-only, which numba takes for another type of array.
+    return np.frombuffer(data, f.dtype).reshape(shape).astype(f.dtype.newbyteorder("="), copy=True)
+
+
+def _read_times(s: Schema, f: Field, tree: dict[str, Any], sizes: dict[str, int]) -> NDArray[np.int64]:
+    base = _read_int(s, Field(f.base, "int", min=_INT64[0], max=_INT64[1] - 2**32), tree, sizes)
+    data = _bin(s, f, tree)
+    _check_length(s, f, len(data), sizes[str(f.shape[0])] * _U32.itemsize)
+    return np.frombuffer(data, _U32) + np.int64(base)
+
+
+def _check_length(s: Schema, f: Field, got: int, want: int) -> None:
+    if got != want:
+        reason = "wire.column_short" if got < want else "wire.column_long"
+        raise WireError(reason, f"{s.name}: {f.offsets or f.name} has {got} bytes, {want} belong there")
+
+
+def _check_column(s: Schema, f: Field, values: dict[str, Any]) -> None:
+    """What a schema promises of a column's values."""
+    a = values[f.name]
+    if a.size == 0:
+        return
+    if (f.finite is True or (f.finite and values[f.finite])) and not np.isfinite(a).all():
+        raise WireError("wire.not_finite", f"{s.name}: {f.name} holds NaN or inf")
+    wrong = (
+        (f.min is not None and a.min() < f.min)
+        or (f.max is not None and a.max() > f.max)
+        or (f.above is not None and not a.min() > f.above)
+        or (f.below and a.max() >= values[f.below])
+    )
+    if wrong:
+        raise WireError("wire.bounds", f"{s.name}: {f.name} holds {a.min()} .. {a.max()}")
+    if f.order == "increasing" and not (a[1:] > a[:-1]).all():
+        raise WireError("wire.time_backwards" if f.name.endswith("t_ns") else "wire.order", f"{s.name}: {f.name}")
+
+
+_READ: dict[str, Callable[[Schema, Field, dict[str, Any], dict[str, int]], Any]] = {
+    "int": _read_int,
+    "float": _read_float,
+    "bool": _read_bool,
+    "str": _read_str,
+    "map": _read_map,
+    "column": _read_column,
+    "times": _read_times,
+}
+
+
+# --- writing ---
+
+_PLAIN: dict[str, Callable[[Any], Any]] = {"int": operator.index, "float": float, "bool": bool, "str": str}
+
+
+def _write_plain(s: Schema, f: Field, value: Any, tree: dict[str, Any], sizes: dict[str, int]) -> None:
+    """A scalar; numpy's scalars become Python's."""
+    try:
+        tree[f.name] = _PLAIN[f.kind](value)
+    except TypeError:
+        raise WireError("wire.field_type", f"{s.name}: {f.name} = {_short(value)}") from None
+
+
+def _write_map(s: Schema, f: Field, value: Any, tree: dict[str, Any], sizes: dict[str, int]) -> None:
+    plain = _PLAIN[f.values]
+    tree[f.name] = {str(k): plain(v) for k, v in value.items()}
+
+
+def _write_column(s: Schema, f: Field, value: Any, tree: dict[str, Any], sizes: dict[str, int]) -> None:
+    assert f.dtype is not None
+    _check_array(s, f, value, f.dtype, sizes)
+    tree[f.name] = np.ascontiguousarray(value, f.dtype).data
+
+
+def _write_times(s: Schema, f: Field, value: Any, tree: dict[str, Any], sizes: dict[str, int]) -> None:
+    _check_array(s, f, value, np.dtype("<i8"), sizes)
+    base = int(value.min()) if value.size else int(tree["t_ns"])
+    if value.size and int(value.max()) - base > 2**32 - 1:
+        span_s = (int(value.max()) - base) * 1e-9
+        raise WireError(
+            "wire.span", f"{s.name}: {f.name} spans {span_s:.3f} s, at most 4.294 s fit; split the packet"
+        )
+    tree[f.base] = base
+    tree[f.offsets] = (value - base).astype(_U32).data
+
+
+def _check_array(s: Schema, f: Field, value: Any, dtype: np.dtype[Any], sizes: dict[str, int]) -> None:
+    if not isinstance(value, np.ndarray) or value.dtype != dtype:
+        got = value.dtype if isinstance(value, np.ndarray) else type(value).__name__
+        raise WireError("wire.dtype", f"{s.name}: {f.name} must be an array of {dtype}, got {got}")
+    want = tuple(part if isinstance(part, int) else sizes.get(part, -1) for part in f.shape)
+    if len(value.shape) != len(want) or any(w not in (-1, g) for w, g in zip(want, value.shape, strict=True)):
+        raise WireError("wire.shape", f"{s.name}: {f.name} must be {list(f.shape)}, got {value.shape}")
+    sizes.update({part: got for part, got in zip(f.shape, value.shape, strict=True) if isinstance(part, str)})
+
+
+_WRITE: dict[str, Callable[[Schema, Field, Any, dict[str, Any], dict[str, int]], None]] = {
+    "int": _write_plain,
+    "float": _write_plain,
+    "bool": _write_plain,
+    "str": _write_plain,
+    "map": _write_map,
+    "column": _write_column,
+    "times": _write_times,
+}
