@@ -1,0 +1,1 @@
+"""Normal flow, inverse depth and IMU samples in; velocity with covariance out."""

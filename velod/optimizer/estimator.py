@@ -1,0 +1,249 @@
+"""From batches of flow and depth and IMU samples to the velocity: the estimate itself, in sensor time, without I/O."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from velod.config import Settings
+from velod.geometry.calibration import Calibration
+from velod.geometry.rectify import rectify
+from velod.geometry.so3 import hat
+from velod.optimizer import flow_equation
+from velod.optimizer.flow_equation import Fit, Rows
+from velod.optimizer.inertial import InertialMemory
+from velod.optimizer.preintegration import Preintegration, preintegrate
+from velod.optimizer.window import Window
+from velod.types import F64, NS_PER_S, DepthBatch, FlowBatch, ImuSamples
+
+BIN_NS = 5_000_000
+"""Flows this close in time share one gyroscope noise (DESIGN 5, item 6)."""
+SMOOTHNESS = {"error": 0.5, "velocity": 5.0}
+"""Weak sigma of the second difference of control points, m/s, by what the spline models."""
+IMU_MODEL_SIGMA = 1e-3
+"""What sampling leaves undetermined of one preintegration interval, m/s."""
+INNOVATION_GATE = 25.0
+"""Squared Mahalanobis distance from which a batch that contradicts the prediction loses weight (5 sigma)."""
+MAX_DIRECTION_SIGMA = 0.5
+"""rad; gravity's direction must be known this well before its norm says anything."""
+
+
+@dataclass(frozen=True, slots=True)
+class Head:
+    """The estimate at the end of the newest batch: [v_B, b_a, b_w, g_L] with covariance (12, 12)."""
+
+    t_ns: int
+    v_B: F64
+    b_a: F64
+    b_w: F64
+    g_L: F64
+    R_LB: F64
+    cov: F64
+
+    @property
+    def gravity_direction_sigma(self) -> float:
+        """Standard deviation of the direction of g_L, rad."""
+        n = self.g_L / np.linalg.norm(self.g_L)
+        across = np.eye(3) - np.outer(n, n)
+        return float(np.sqrt(np.trace(across @ self.cov[9:, 9:] @ across)) / np.linalg.norm(self.g_L))
+
+
+class Estimator:
+    """Sliding-window estimate of v_B by Eq. 14 with the states of Eq. 12 and gravity."""
+
+    def __init__(self, settings: Settings, calibration: Calibration) -> None:
+        o = settings.optimizer
+        rect = rectify(calibration)
+        self._o, self._imu = o, settings.imu
+        self._camera = (rect.f, rect.cx, rect.cy)
+        self._R_CB, self._p_BC_B = rect.R_CB, rect.p_BC_B
+        self._knot_ns = int(o.knot_s * NS_PER_S)
+        self._interval_ns = int(o.preintegration_s * NS_PER_S)
+        self.counters: dict[str, int] = {}
+        self.memory = InertialMemory(o.window_s + 3.0)
+        self._segments = int(np.ceil(o.window_s / o.knot_s)) + 1
+        self._forget()
+
+    def _forget(self) -> None:
+        """Nothing is known of the velocity."""
+        self.window = Window(self._imu, self._knot_ns, self._segments, SMOOTHNESS[self._o.spline])
+        self.head: Head | None = None
+        self.batches = 0  # that gave a velocity
+        self.last_usable_t_ns = 0
+        self._preintegrated_to = 0
+
+    def add_imu(self, samples: ImuSamples) -> None:
+        """Remember IMU samples."""
+        self.memory.append(samples.sample_t_ns, samples.accel, samples.gyro)
+
+    def absorb(self, flow: FlowBatch, depth: DepthBatch) -> None:
+        """Take a batch in; the IMU must cover its end. A batch older than the head adds what it knows."""
+        self.memory.integrate_to(flow.t_ns, *self._biases())
+        if not self.window.empty and not self.memory.covers(self._preintegrated_to, flow.t_ns):
+            self._count("estimate.restart_after_hole")
+            self._forget()
+        rows = self._rows(flow, depth)
+        if self.window.empty:
+            if rows is None:
+                return
+            self._start(int(rows.t_ns.min()))
+        late = self.head is not None and flow.t_ns <= self.head.t_ns
+        predicted = None if late or self.head is None else self.predict(flow.t_ns)
+        if not late:
+            self._extend_to(flow.t_ns)
+        if rows is not None:
+            self._add_flow(flow.t_ns, rows, predicted)
+        self._solve_head(self.head.t_ns if late and self.head is not None else flow.t_ns)
+
+    def predict(self, t_ns: int) -> tuple[F64, F64] | None:
+        """v_B (3,) and its covariance (3, 3) at ``t_ns``, carried there from the head by the IMU (Eq. 10)."""
+        head = self.head
+        if head is None or not self.memory.covers(head.t_ns, t_ns):
+            return None
+        p = self._preintegrate(head.t_ns, t_ns, head.b_a, head.b_w)
+        R_T = p.R_gamma.T
+        g_B = head.R_LB.T @ head.g_L
+        # Eq. 10 (with beta rotated by R_WB_i) in the frame B_j
+        v = R_T @ (p.beta + head.v_B - g_B * p.dt)
+        J = np.hstack(
+            [
+                R_T,
+                R_T @ p.d_beta_d_ba,
+                R_T @ p.d_beta_d_bw + hat(v) @ p.d_theta_d_bw,
+                -R_T @ head.R_LB.T * p.dt,
+            ]
+        )
+        N = np.hstack([hat(v), R_T])
+        return v, J @ head.cov @ J.T + N @ p.cov @ N.T
+
+    def _biases(self) -> tuple[F64, F64]:
+        return (np.zeros(3), np.zeros(3)) if self.head is None else (self.head.b_a, self.head.b_w)
+
+    def _count(self, name: str) -> None:
+        self.counters[name] = self.counters.get(name, 0) + 1
+
+    def _preintegrate(self, t_i: int, t_j: int, b_a: F64, b_w: F64) -> Preintegration:
+        m = self.memory
+        return preintegrate(m.t_ns, m.accel, m.gyro, t_i, t_j, b_a, b_w, self._imu.accel_noise, self._imu.gyro_noise)
+
+    def _frame(self, t_ns: int) -> tuple[F64, F64, F64]:
+        """R_LB and the affine map from spline to body velocity at ``t_ns``: v_B = N + M spline(t)."""
+        R, s, _ = self.memory.at(np.array([t_ns]))
+        if self._o.spline == "velocity":
+            return R[0], np.zeros(3), np.eye(3)
+        return R[0], R[0].T @ s[0], R[0].T
+
+    def _rows(self, flow: FlowBatch, depth: DepthBatch) -> Rows | None:
+        """Rows of the flow equation on the spline and b_w, where flow and depth speak of the same event."""
+        _, at_flow, at_depth = np.intersect1d(flow.index, depth.index, assume_unique=True, return_indices=True)
+        t = flow.t_ns - flow.age[at_flow].astype(np.int64)
+        inside = (t >= self.memory.t_ns[0]) & (self.window.empty | (t >= self.window.first * self._knot_ns))
+        at_flow, at_depth, t = at_flow[inside], at_depth[inside], t[inside]
+        if len(t) < self._o.min_flows:
+            self._count("batch.few_flows")
+            return None
+        inv_depth = depth.inv_depth[at_depth]
+        a_B, b_B = flow_equation.body_rows(
+            (flow.x[at_flow], flow.y[at_flow]), flow.n[at_flow], inv_depth, self._camera, self._R_CB, self._p_BC_B
+        )
+        R_LB, s_L, w_B = self.memory.at(t)
+        # Eq. 4: |x_n| - n^T B w = (n^T A / Z) v
+        z = flow.speed[at_flow].astype(np.float64) - np.einsum("ij,ij->i", b_B, w_B)
+        if self._o.weights == "fixed":
+            sigma = np.full(len(t), self._o.fixed_sigma_px_s)
+        else:
+            sigma = flow_equation.sigmas(flow.sigma[at_flow], inv_depth, depth.sigma[at_depth], z)
+        a = a_B
+        if self._o.spline == "error":
+            a = np.einsum("ijk,ik->ij", R_LB, a_B)
+            z = z - np.einsum("ij,ij->i", a, s_L)
+        return Rows(t, z, a, b_B, sigma)
+
+    def _start(self, t_ns: int) -> None:
+        self.window.start(t_ns)
+        self._preintegrated_to = t_ns
+
+    def _extend_to(self, t_ns: int) -> None:
+        """Open segments and add the inertial factors of the complete preintegration intervals up to ``t_ns``."""
+        g_L = self._gravity()
+        while not self.window.contains(t_ns):
+            end = (self.window.last + 1) * self._knot_ns
+            times = np.linspace(end - self._knot_ns, end, 21).astype(np.int64)
+            R, _, _ = self.memory.at(np.maximum(times, self.memory.t_ns[0]))
+            D_L = np.asarray(R.mean(axis=0)) * self._o.knot_s
+            self.window.extend(D_L, g_L, self._biases()[1], self._o.knot_s)
+            self._inertial_factors_to(min(t_ns, end + self._knot_ns))
+        self._inertial_factors_to(t_ns)
+
+    def _inertial_factors_to(self, t_ns: int) -> None:
+        while True:
+            t_i = self._preintegrated_to
+            t_j = (t_i // self._interval_ns + 1) * self._interval_ns
+            if t_j > t_ns or not self.window.contains(t_j):
+                return
+            self.window.add(*self._inertial_factor(t_i, t_j))
+            self._preintegrated_to = t_j
+
+    def _gravity(self) -> F64:
+        return np.zeros(3) if self.head is None else self.head.g_L
+
+    def _inertial_factor(self, t_i: int, t_j: int) -> tuple[F64, F64, F64]:
+        """(J, r, information) of Eq. 14's inertial residual over [t_i, t_j], in the frame B_i."""
+        b_a, b_w = self._biases()
+        p = self._preintegrate(t_i, t_j, b_a, b_w)
+        R_LBi, N_i, M_i = self._frame(t_i)
+        _, N_j, M_j = self._frame(t_j)
+        predicted = self.predict(t_j) if self.head is not None and t_j >= self.head.t_ns else None
+        v_j = predicted[0] if predicted is not None else (np.zeros(3) if self.head is None else self.head.v_B)
+        J_bw = p.d_beta_d_bw + p.R_gamma @ hat(v_j) @ p.d_theta_d_bw
+        w = self.window
+        F_i = w.selector(t_i)
+        # Eq. 14: beta(b) - R(gamma(b)) v_j - g_B dt + v_i = 0
+        J = M_i @ F_i[:3] - p.R_gamma @ M_j @ w.spline_row(t_j)
+        J += p.d_beta_d_ba @ F_i[3:6] + J_bw @ F_i[6:9] - R_LBi.T @ F_i[9:12] * p.dt
+        r = p.d_beta_d_ba @ b_a + J_bw @ b_w - p.beta + p.R_gamma @ N_j - N_i
+        # the gyroscope's noise enters through R(gamma) v too, which Eq. 9 alone omits
+        G = np.hstack([p.R_gamma @ hat(v_j), np.eye(3)])
+        cov = G @ p.cov @ G.T + np.eye(3) * IMU_MODEL_SIGMA**2
+        return J, r, np.linalg.inv(cov)
+
+    def _add_flow(self, t_ns: int, rows: Rows, predicted: tuple[F64, F64] | None) -> None:
+        fit = flow_equation.solve(rows, self._o.ransac_iterations, self._o.seed + t_ns // 1000)
+        if fit is None:
+            self._count("batch.undetermined")
+            return
+        shared = self._o.shared_error
+        if predicted is not None:
+            shared *= max(1.0, self._innovation(t_ns, fit, predicted) / INNOVATION_GATE)
+        if shared > self._o.shared_error:
+            self._count("batch.inconsistent")
+        for info in flow_equation.compress(rows, fit, BIN_NS, self._imu.gyro_noise, shared):
+            self.window.add_information(info.t_ns, info.L, info.eta)
+        self.batches += 1
+        self.last_usable_t_ns = max(self.last_usable_t_ns, t_ns)
+
+    def _innovation(self, t_ns: int, fit: Fit, predicted: tuple[F64, F64]) -> float:
+        """Squared Mahalanobis distance of the batch's own velocity from the predicted one."""
+        _, N, M = self._frame(t_ns)
+        d = N + M @ fit.e - predicted[0]
+        # the fit is of the batch's middle: what gravity does until its end is in the tolerance
+        S = M @ fit.cov @ M.T * self._o.shared_error + predicted[1] + np.eye(3) * 0.05**2
+        return float(d @ np.linalg.solve(S, d))
+
+    def _solve_head(self, t_ns: int) -> None:
+        """Optimum of the window and the state at ``t_ns``, with the IMU of the last incomplete interval."""
+        extra = []
+        if t_ns > self._preintegrated_to:
+            extra.append(self._inertial_factor(self._preintegrated_to, t_ns))
+        g_prior, g_sigma = None, 0.0
+        if self.head is not None and self.head.gravity_direction_sigma < MAX_DIRECTION_SIGMA:
+            g_prior, g_sigma = self.head.g_L, self.head.gravity_direction_sigma
+        solution = self.window.solve(extra, g_prior, g_sigma)
+        F = self.window.selector(t_ns)
+        R_LB, N, M = self._frame(t_ns)
+        x = F @ solution.x
+        T = np.eye(12)
+        T[:3, :3] = M
+        cov = T @ solution.cov(F) @ T.T
+        self.head = Head(t_ns, N + M @ x[:3], x[3:6], x[6:9], x[9:12], R_LB, cov)

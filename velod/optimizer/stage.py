@@ -1,0 +1,246 @@
+"""The optimizer as a stage: joins flow, depth and IMU in sensor-time order and puts out velocities at a fixed rate.
+
+What comes out depends on sensor time alone, not on the order or moment of arrival: batches are taken in by their end
+time, and the velocity at tick tau is made once every batch that ended by tau has been taken in. Only where a batch
+stays away for longer than ``max_wait_ms`` of sensor time is a velocity made without it; it is then taken in late.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from velod.config import Settings
+from velod.geometry.calibration import Calibration
+from velod.optimizer.estimator import Estimator
+from velod.types import NS_PER_S, DepthBatch, FlowBatch, ImuSamples, TrackingState, Velocity
+
+UNKNOWN_SIGMA = 100.0
+"""Of a velocity nothing is known about, m/s."""
+MIN_BATCHES = 3
+"""Batches with a velocity before the first valid one."""
+VALID_SIGMA, VALID_SHARE = 0.25, 0.02
+"""A velocity becomes valid when its largest sigma is below VALID_SIGMA m/s + VALID_SHARE of its speed ..."""
+LOST_FACTOR = 4.0
+"""... and stays valid until it is this many times larger."""
+DEGRADED_AFTER_NS = 100_000_000
+"""Without usable flow for so long the estimate runs on the IMU alone."""
+CLOCK_RESTART_NS = 10 * NS_PER_S
+"""Events this far back in time mean that the sensor's clock was set anew."""
+IMU_GAP_NS = NS_PER_S
+"""A longer hole in the IMU cannot be bridged: start anew."""
+
+
+@dataclass(slots=True)
+class _Pending:
+    """Parts of one batch that have arrived."""
+
+    flow: FlowBatch | None = None
+    depth: DepthBatch | None = None
+
+
+class OptimizerStage:
+    """``handle(FlowBatch | DepthBatch | ImuSamples) -> [Velocity]``."""
+
+    def __init__(self, settings: Settings, calibration: Calibration) -> None:
+        self._settings, self._calibration = settings, calibration
+        self._hz = settings.optimizer.output_hz
+        wait = settings.optimizer.max_wait_ms
+        self._max_wait_ns = int(wait * 1e6) if np.isfinite(wait) else None
+        self.counters: dict[str, int] = {}
+        self.alarms: dict[str, str] = {}
+        self._seq = 0
+        self._reset()
+
+    def _reset(self) -> None:
+        self._estimator = Estimator(self._settings, self._calibration)
+        self._estimator.counters = self.counters
+        self._forget_batches()
+        self._imu_t_ns = 0
+        self._event_t_ns = 0
+        self._tick = -1  # number of the next velocity on the grid of the output rate
+        self._was_valid = False
+        self._newest = (-1, 0)  # seq and t_ns of the newest batch taken in
+
+    def handle(self, message: FlowBatch | DepthBatch | ImuSamples) -> list[Velocity]:
+        """Take one message; return the velocities that it completes. Raises TypeError for other messages."""
+        if isinstance(message, ImuSamples):
+            self._take_imu(message)
+        elif isinstance(message, FlowBatch | DepthBatch):
+            self._take_part(message)
+        else:
+            raise TypeError(f"the optimizer does not take {type(message).__name__}")
+        return self._advance()
+
+    def _count(self, name: str, by: int = 1) -> None:
+        self.counters[name] = self.counters.get(name, 0) + by
+
+    def _take_part(self, part: FlowBatch | DepthBatch) -> None:
+        """Keep one part of a batch until the other comes; what is of no use is counted."""
+        seq = part.seq
+        if seq in self._taken or seq < self._next_seq:
+            self._count("batch.duplicate")
+            return
+        pending = self._pending.setdefault(seq, _Pending())
+        other = pending.depth if isinstance(part, FlowBatch) else pending.flow
+        if other is not None and other.t_ns != part.t_ns:
+            # one of them is from before a restart of ingest, which counts from 0 again
+            self._count("batch.of_another_ingest")
+            if other.t_ns > part.t_ns:
+                return
+            self._pending[seq] = pending = _Pending()
+        if isinstance(part, FlowBatch):
+            pending.flow = part
+        else:
+            pending.depth = part
+
+    def _take_imu(self, m: ImuSamples) -> None:
+        if m.event_t_ns + CLOCK_RESTART_NS < self._event_t_ns:
+            self._count("clock.restart")
+            self._reset()
+        elif m.batch_seq < self._closed_seq:
+            self._count("ingest.restart")
+            self._forget_batches()
+        if self._next_seq < 0:
+            self._next_seq = m.batch_seq + 1
+            # what came before the first word of ingest belongs to the past
+            self._pending = {s: p for s, p in self._pending.items() if s >= self._next_seq}
+        for seq in range(max(self._closed_seq + 1, self._next_seq), m.batch_seq + 1):
+            self._ends[seq] = m.batch_t_ns  # exact for the newest, the latest possible for one not heard of
+        self._closed_seq = m.batch_seq
+        self._event_t_ns = max(self._event_t_ns, m.event_t_ns)
+        self._append_samples(m)
+
+    def _forget_batches(self) -> None:
+        """Nothing is known of the batches of this ingest yet."""
+        self._pending: dict[int, _Pending] = {}  # by seq
+        self._ends: dict[int, int] = {}  # seq -> end of closed batches that have not been taken in
+        self._taken: set[int] = set()  # taken in before an earlier one that is still missing
+        self._next_seq = -1  # first batch not yet taken in nor given up; -1: nothing heard from ingest yet
+        self._closed_seq = -1  # newest batch that ingest has closed
+
+    def _append_samples(self, m: ImuSamples) -> None:
+        new = m.sample_t_ns > self._imu_t_ns
+        if not new.all():
+            self._count("imu.backwards", int((~new).sum()))
+        if not new.any():
+            return
+        t = m.sample_t_ns[new]
+        if self._imu_t_ns and t[0] - self._imu_t_ns > IMU_GAP_NS:
+            self._count("imu.gap_restart")
+            self._restart_after_gap()
+        self._estimator.memory.append(t, m.accel[new], m.gyro[new])
+        self._imu_t_ns = int(t[-1])
+        if self._tick < 0:
+            self._tick = self._tick_after(int(t[0]) - 1)
+
+    def _restart_after_gap(self) -> None:
+        self._estimator = Estimator(self._settings, self._calibration)
+        self._estimator.counters = self.counters
+        self._was_valid = False
+        self._tick = -1
+
+    def _tick_ns(self, k: int) -> int:
+        return k * NS_PER_S // int(self._hz) if self._hz.is_integer() else int(k * (NS_PER_S / self._hz))
+
+    def _tick_after(self, t_ns: int) -> int:
+        k = int(t_ns * self._hz / NS_PER_S) - 1
+        while self._tick_ns(k) <= t_ns:
+            k += 1
+        return k
+
+    def _advance(self) -> list[Velocity]:
+        """Everything that can be done now, in sensor-time order."""
+        out: list[Velocity] = []
+        while self._tick >= 0 and self._imu_t_ns >= (tau := self._tick_ns(self._tick)):
+            complete = self._take_in_order(tau)
+            if not complete:
+                if self._max_wait_ns is None or self._imu_t_ns < tau + self._max_wait_ns:
+                    break
+                self._count("velocity.without_batch")
+                self._take_out_of_order(tau)
+            out.append(self._velocity(tau))
+            self._tick += 1
+        return out
+
+    def _take_in_order(self, tau: int) -> bool:
+        """Take in the batches that ended by ``tau``; False while one of them, or word of the events, is missing."""
+        while self._next_seq >= 0:
+            p = self._pending.get(self._next_seq)
+            if self._next_seq in self._taken:
+                self._next_after(self._next_seq)
+            elif p is not None and p.flow is not None and p.depth is not None:
+                if p.flow.t_ns > tau:
+                    return True
+                self._take_in(self._next_seq, p.flow, p.depth)
+                self._next_after(self._next_seq)
+            elif self._next_seq <= self._closed_seq:
+                return self._ends[self._next_seq] > tau
+            else:
+                return self._event_t_ns >= tau
+        return False
+
+    def _take_out_of_order(self, tau: int) -> None:
+        """Take in whatever is complete, and give up what is about to leave the window."""
+        for seq in sorted(self._pending):
+            p = self._pending[seq]
+            if p.flow is not None and p.depth is not None and p.flow.t_ns <= tau:
+                self._take_in(seq, p.flow, p.depth)
+                self._taken.add(seq)
+        oldest = tau - int(self._settings.optimizer.window_s * NS_PER_S)
+        while 0 <= self._next_seq <= self._closed_seq:
+            if self._next_seq not in self._taken:
+                if self._ends[self._next_seq] > oldest:
+                    return
+                self._count("batch.lost")
+            self._next_after(self._next_seq)
+
+    def _next_after(self, seq: int) -> None:
+        self._pending.pop(seq, None)
+        self._ends.pop(seq, None)
+        self._taken.discard(seq)
+        self._next_seq = seq + 1
+
+    def _take_in(self, seq: int, flow: FlowBatch, depth: DepthBatch) -> None:
+        del self._pending[seq]
+        if not self._estimator.memory.covers(flow.t_ns, flow.t_ns):
+            self._count("batch.before_imu")
+            return
+        head = self._estimator.head
+        if head is not None and flow.t_ns < head.t_ns:
+            self._count("batch.late")
+            if not self._estimator.window.contains(flow.t_ns):
+                self._count("batch.too_late")
+                return
+        self._estimator.absorb(flow, depth)
+        if flow.t_ns > self._newest[1]:
+            self._newest = (seq, flow.t_ns)
+
+    def _velocity(self, tau: int) -> Velocity:
+        predicted = self._estimator.predict(tau)
+        if predicted is None:
+            v, cov = np.zeros(3), np.eye(3) * UNKNOWN_SIGMA**2
+        else:
+            v, cov = predicted
+        state, reason, valid = self._judge(tau, v, cov)
+        self._seq += 1
+        return Velocity(self._seq - 1, tau, v, cov, valid, state, reason, *self._newest)
+
+    def _judge(self, tau: int, v: np.ndarray, cov: np.ndarray) -> tuple[str, str, bool]:
+        """State, reason and validity of an estimate."""
+        sigma = float(np.sqrt(np.linalg.eigvalsh(cov)[-1]))
+        limit = VALID_SIGMA + VALID_SHARE * float(np.linalg.norm(v))
+        if not self._was_valid:
+            if self._estimator.batches < MIN_BATCHES:
+                return TrackingState.INITIALISING, f"{self._estimator.batches} usable batches", False
+            if sigma > limit:
+                return TrackingState.INITIALISING, f"sigma {sigma:.2f} m/s", False
+            self._was_valid = True
+        if sigma > LOST_FACTOR * limit:
+            self._was_valid = False
+            return TrackingState.LOST, f"sigma {sigma:.2f} m/s", False
+        alone_ns = tau - self._estimator.last_usable_t_ns
+        if alone_ns > DEGRADED_AFTER_NS:
+            return TrackingState.DEGRADED, f"no flow for {alone_ns * 1e-6:.0f} ms", True
+        return TrackingState.TRACKING, "", True
