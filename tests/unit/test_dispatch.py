@@ -1,0 +1,83 @@
+"""The dispatcher: who gets what, in plain cases."""
+
+from __future__ import annotations
+
+import pytest
+
+from velod.runtime.dispatch import Assignment, Dispatcher
+
+
+def sent(assignments: list[Assignment[str]]) -> list[tuple[str, int]]:
+    return [(a.worker, a.seq) for a in assignments]
+
+
+def test_batches_wait_until_a_worker_is_there() -> None:
+    d: Dispatcher[str] = Dispatcher(window=2)
+    assert d.submit(0, "x", 0.0) == []
+    assert d.submit(1, "y", 0.0) == []
+    assert sent(d.join("flow-0", 0.0)) == [("flow-0", 0), ("flow-0", 1)]
+
+
+def test_two_workers_share_the_batches() -> None:
+    d: Dispatcher[str] = Dispatcher(window=2)
+    d.join("flow-1", 0.0)
+    d.join("flow-0", 0.0)
+    assert [sent(d.submit(i, "", 0.0)) for i in range(4)] == [
+        [("flow-0", 0)],
+        [("flow-1", 1)],
+        [("flow-0", 2)],
+        [("flow-1", 3)],
+    ]
+
+
+def test_a_killed_worker_s_batches_go_to_the_other_oldest_first() -> None:
+    d: Dispatcher[str] = Dispatcher(window=4)
+    d.join("flow-0", 0.0)
+    for i in range(3):
+        d.submit(i, "", 0.0)
+    d.join("flow-1", 0.0)
+    assert sent(d.leave("flow-0", 0.0)) == [("flow-1", 0), ("flow-1", 1), ("flow-1", 2)]
+    assert d.counters == {"dispatch.resent": 3}
+
+
+def test_a_worker_that_restarts_under_its_name_is_sent_its_batches_again() -> None:
+    d: Dispatcher[str] = Dispatcher(window=2)
+    d.join("flow-0", 0.0)
+    d.submit(7, "", 0.0)
+    assert sent(d.join("flow-0", 0.0)) == [("flow-0", 7)]
+
+
+def test_the_oldest_waiting_batch_is_dropped_and_counted() -> None:
+    d: Dispatcher[str] = Dispatcher(window=1, capacity=2)
+    for i in range(5):
+        d.submit(i, "", 0.0)
+    assert d.waiting == (3, 4)
+    assert d.counters == {"dispatch.overflow": 3}
+
+
+def test_a_silent_worker_is_passed_over_until_it_finishes_something() -> None:
+    d: Dispatcher[str] = Dispatcher(window=2, timeout_s=1.0)
+    d.join("flow-0", 0.0)
+    d.submit(0, "", 0.0)
+    d.join("flow-1", 0.0)
+    assert d.expire(0.9) == []
+    assert sent(d.expire(1.1)) == [("flow-1", 0)]
+    assert sent(d.submit(1, "", 1.2)) == [("flow-1", 1)]
+    d.done("flow-0", 0, 1.3)
+    assert sent(d.submit(2, "", 1.4)) == [("flow-0", 2)]
+    assert d.counters == {"dispatch.expired": 1}
+
+
+def test_the_only_worker_is_tried_again_after_a_lost_message() -> None:
+    d: Dispatcher[str] = Dispatcher(window=1, timeout_s=1.0)
+    d.join("flow-0", 0.0)
+    d.submit(0, "", 0.0)
+    assert sent(d.expire(1.5)) == [("flow-0", 0)]
+    d.done("flow-0", 0, 1.6)
+    assert d.workers == {"flow-0": ()}
+
+
+@pytest.mark.parametrize(("window", "capacity", "timeout_s"), [(0, 1, 1.0), (1, 0, 1.0), (1, 1, 0.0)])
+def test_nonsense_sizes_are_refused(window: int, capacity: int, timeout_s: float) -> None:
+    with pytest.raises(ValueError, match="at least 1"):
+        Dispatcher(window, capacity, timeout_s)

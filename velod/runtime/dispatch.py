@@ -1,0 +1,126 @@
+"""Which worker gets which batch: the least loaded one, and what a dead worker held goes to another.
+
+Zenoh has no consumer groups, so the producer chooses. No input or output and no clock here: calls in, assignments
+out; ``now_s`` is any clock that does not go backwards.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Generic, TypeVar
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class Assignment(Generic[T]):
+    """Send ``batch`` to ``worker``."""
+
+    worker: str
+    seq: int
+    batch: T
+
+
+@dataclass(slots=True)
+class _Worker(Generic[T]):
+    # seq -> (batch, when it was sent), oldest first: what it has not finished.
+    outstanding: dict[int, tuple[T, float]] = field(default_factory=dict)
+    silent: bool = False  # let a batch expire, and has finished nothing since
+
+
+class Dispatcher(Generic[T]):
+    """Batches go to the worker with the fewest outstanding ones (ties: the lowest name), ``window`` each at the most.
+
+    While every window is full, or nobody is there, batches wait in a queue of ``capacity`` (None: unbounded, for
+    lossless replay); when it is full the oldest are dropped and counted as ``dispatch.overflow``. What a worker had
+    not finished when it left is sent to others, before newer batches (``dispatch.resent``). A worker that does not
+    finish a batch in ``timeout_s`` is treated likewise (``dispatch.expired``), and then is given work only while
+    there is nobody else, until it finishes something: its message may have been lost, or it hangs.
+    """
+
+    def __init__(self, window: int = 2, capacity: int | None = 64, timeout_s: float = math.inf) -> None:
+        if window < 1 or (capacity is not None and capacity < 1) or not timeout_s > 0.0:
+            raise ValueError("window and capacity must be at least 1, timeout_s positive")
+        self.counters: dict[str, int] = {}
+        self._window = window
+        self._capacity = capacity
+        self._timeout_s = timeout_s
+        self._workers: dict[str, _Worker[T]] = {}
+        self._queue: deque[tuple[int, T]] = deque()
+
+    def join(self, worker: str, now_s: float) -> list[Assignment[T]]:
+        """A worker is there. One that is already known has been started anew: what it held is sent again."""
+        if worker in self._workers:
+            self._requeue(self._workers[worker], "dispatch.resent")
+        self._workers[worker] = _Worker()
+        return self._assign(now_s)
+
+    def leave(self, worker: str, now_s: float) -> list[Assignment[T]]:
+        """A worker is gone."""
+        gone = self._workers.pop(worker, None)
+        if gone is not None:
+            self._requeue(gone, "dispatch.resent")
+        return self._assign(now_s)
+
+    def submit(self, seq: int, batch: T, now_s: float) -> list[Assignment[T]]:
+        """A new batch; ``seq`` identifies it."""
+        self._queue.append((seq, batch))
+        assignments = self._assign(now_s)
+        while self._capacity is not None and len(self._queue) > self._capacity:
+            self._queue.popleft()
+            self._count("dispatch.overflow", 1)
+        return assignments
+
+    def done(self, worker: str, seq: int, now_s: float) -> list[Assignment[T]]:
+        """A worker has finished a batch; one that was given to another meanwhile changes nothing there."""
+        known = self._workers.get(worker)
+        if known is not None:
+            known.outstanding.pop(seq, None)
+            known.silent = False
+        return self._assign(now_s)
+
+    def expire(self, now_s: float) -> list[Assignment[T]]:
+        """Call now and then: takes back what has been outstanding for too long."""
+        for worker in self._workers.values():
+            if any(now_s - sent_s > self._timeout_s for _, sent_s in worker.outstanding.values()):
+                self._requeue(worker, "dispatch.expired")
+                worker.silent = True
+        return self._assign(now_s)
+
+    @property
+    def workers(self) -> dict[str, tuple[int, ...]]:
+        """Who is there, and the batches each was sent and has not finished."""
+        return {name: tuple(w.outstanding) for name, w in self._workers.items()}
+
+    @property
+    def waiting(self) -> tuple[int, ...]:
+        """The batches that wait for a worker, the next one first."""
+        return tuple(seq for seq, _ in self._queue)
+
+    def _requeue(self, worker: _Worker[T], why: str) -> None:
+        self._queue.extendleft((seq, batch) for seq, (batch, _) in reversed(worker.outstanding.items()))
+        self._count(why, len(worker.outstanding))
+        worker.outstanding.clear()
+
+    def _assign(self, now_s: float) -> list[Assignment[T]]:
+        assignments: list[Assignment[T]] = []
+        while self._queue and (name := self._choose()) is not None:
+            seq, batch = self._queue.popleft()
+            self._workers[name].outstanding[seq] = (batch, now_s)
+            assignments.append(Assignment(name, seq, batch))
+        return assignments
+
+    def _choose(self) -> str | None:
+        responsive = {name: w for name, w in self._workers.items() if not w.silent}
+        free = [
+            (len(w.outstanding), name)
+            for name, w in (responsive or self._workers).items()
+            if len(w.outstanding) < self._window
+        ]
+        return min(free)[1] if free else None
+
+    def _count(self, name: str, n: int) -> None:
+        if n:
+            self.counters[name] = self.counters.get(name, 0) + n
