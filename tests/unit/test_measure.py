@@ -1,0 +1,64 @@
+"""Latency percentiles and sequence gaps."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from velod.runtime.measure import GapCounter, LatencyRing
+
+
+def seen(window: int, *seqs: int) -> GapCounter:
+    gaps = GapCounter(window)
+    for seq in seqs:
+        gaps.see(seq)
+    return gaps
+
+
+def test_percentiles_are_numpy_s_in_milliseconds() -> None:
+    ring = LatencyRing()
+    for ns in range(1_000_000, 101_000_000, 1_000_000):
+        ring.add(ns)
+    assert ring.percentiles() == pytest.approx(tuple(np.percentile(np.arange(1, 101), (50, 99))))
+
+
+def test_only_the_newest_samples_count() -> None:
+    ring = LatencyRing(capacity=4)
+    for ms in (1000, 1000, 1, 1, 1, 1):
+        ring.add(ms * 1_000_000)
+    assert ring.percentiles() == (1.0, 1.0)
+
+
+def test_no_sample_no_percentile() -> None:
+    ring = LatencyRing()
+    ring.add(5)
+    ring.clear()
+    assert ring.percentiles() is None
+
+
+def test_an_unbroken_stream_has_no_gaps_wherever_it_starts() -> None:
+    assert seen(0, 17, 18, 19).lost == 0
+
+
+def test_missing_messages_are_counted_at_once_in_an_ordered_stream() -> None:
+    assert seen(0, 0, 1, 4, 5).lost == 2
+
+
+def test_a_message_that_was_overtaken_is_not_lost() -> None:
+    assert seen(4, 0, 2, 1, 4, 3, 5, 6, 7, 8, 9, 10, 11).lost == 0
+
+
+def test_a_missing_message_is_lost_once_it_is_out_of_the_window() -> None:
+    assert seen(4, 0, 2, 3, 4, 5).lost == 0
+    assert seen(4, 0, 2, 3, 4, 5, 6).lost == 1
+
+
+def test_a_large_jump_counts_everything_but_the_window() -> None:
+    assert seen(4, 0, 1000).lost == 995
+
+
+def test_a_publisher_that_starts_anew_is_no_gap() -> None:
+    gaps = seen(0, 5, 6, 0, 1, 2)
+    assert (gaps.lost, gaps.restarts) == (0, 1)
+    gaps = seen(64, 0, 1, 0, 1, 2)
+    assert (gaps.lost, gaps.restarts) == (0, 1)
