@@ -1,4 +1,4 @@
-"""From batches of flow and depth and IMU samples to the velocity: the estimate itself, in sensor time, without I/O."""
+"""From batches of flow and depth and IMU samples to the velocity, in sensor time, without I/O."""
 
 from __future__ import annotations
 
@@ -206,7 +206,7 @@ class Estimator:
         # the gyroscope's noise enters through R(gamma) v too, which Eq. 9 alone omits
         G = np.hstack([p.R_gamma @ hat(v_j), np.eye(3)])
         cov = G @ p.cov @ G.T + np.eye(3) * IMU_MODEL_SIGMA**2
-        return J, r, np.linalg.inv(cov)
+        return J, r, np.asarray(np.linalg.inv(cov))
 
     def _add_flow(self, t_ns: int, rows: Rows, predicted: tuple[F64, F64] | None) -> None:
         fit = flow_equation.solve(rows, self._o.ransac_iterations, self._o.seed + t_ns // 1000)

@@ -1,8 +1,9 @@
 """IMU samples in memory, and the motion integrated from them: the frame L.
 
-L is B at the first sample, carried on by the gyroscope alone: R_LB(t). ``s_L(t)`` is the integral of R_LB (a - b_a),
-gravity included; the velocity is v_B = R_BL (s_L + e), whose error e is what the spline models. R_LB and s_L are fixed
-functions of time once integrated: whatever is wrong with them (bias, gravity, start) is in e and in the other states.
+L is B at the first sample, carried on by the gyroscope alone: R_LB(t). ``s_L(t)`` is the integral of
+R_LB (a - b_a), gravity included; the velocity is v_B = R_BL (s_L + e), whose error e is what the spline models. R_LB
+and s_L are fixed functions of time once integrated: whatever is wrong with them (bias, gravity, start) is in e and in
+the other states.
 """
 
 from __future__ import annotations

@@ -51,6 +51,11 @@ class OptimizerStage:
         self.counters: dict[str, int] = {}
         self.alarms: dict[str, str] = {}
         self._seq = 0
+        self._pending: dict[int, _Pending] = {}  # by seq
+        self._ends: dict[int, int] = {}  # seq -> end of closed batches that have not been taken in
+        self._taken: set[int] = set()  # taken in before an earlier one that is still missing
+        self._next_seq = -1  # first batch not yet taken in nor given up; -1: nothing heard from ingest yet
+        self._closed_seq = -1  # newest batch that ingest has closed
         self._reset()
 
     def _reset(self) -> None:
@@ -114,11 +119,11 @@ class OptimizerStage:
 
     def _forget_batches(self) -> None:
         """Nothing is known of the batches of this ingest yet."""
-        self._pending: dict[int, _Pending] = {}  # by seq
-        self._ends: dict[int, int] = {}  # seq -> end of closed batches that have not been taken in
-        self._taken: set[int] = set()  # taken in before an earlier one that is still missing
-        self._next_seq = -1  # first batch not yet taken in nor given up; -1: nothing heard from ingest yet
-        self._closed_seq = -1  # newest batch that ingest has closed
+        self._pending.clear()
+        self._ends.clear()
+        self._taken.clear()
+        self._next_seq = -1
+        self._closed_seq = -1
 
     def _append_samples(self, m: ImuSamples) -> None:
         new = m.sample_t_ns > self._imu_t_ns

@@ -1,9 +1,9 @@
 """The sliding window: control points, biases and gravity of the last segments, in information form.
 
-States, in this order: c_k, c_{k+1}, c_{k+2}, then for every segment k its newest control point c_{k+3}, its biases b_a
-and b_w, and g_L, the specific force of gravity in the frame L at the segment (Eq. 12, with gravity beside the biases).
-All factors are linear in the states at the linearisation of their first sight, so that they add up in one information
-matrix, and leaving the window (marginalisation) is a Schur complement that loses nothing.
+States, in this order: c_k, c_{k+1}, c_{k+2}, then for every segment k its newest control point c_{k+3}, its biases
+b_a and b_w, and g_L, the specific force of gravity in the frame L at the segment (Eq. 12, with gravity beside the
+biases). All factors are linear in the states at the linearisation of their first sight, so that they add up in one
+information matrix, and leaving the window (marginalisation) is a Schur complement that loses nothing.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ class Window:
         J[np.arange(3), new_g], J[np.arange(3), old_g] = 1.0, -1.0
         J[:, old_b[3:]] = turn
         noise = hat(g_L) @ hat(g_L).T * self._imu.gyro_noise**2 * dt + np.eye(3) * 1e-8
-        self.add(J, turn @ b_w, np.linalg.inv(noise))
+        self.add(J, turn @ b_w, np.asarray(np.linalg.inv(noise)))
         self._smooth_newest()
 
     def control_columns(self, segment: int) -> list[int]:

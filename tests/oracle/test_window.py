@@ -1,0 +1,149 @@
+"""The sliding window against the full batch solution, and its factors against central differences."""
+
+import numpy as np
+import pytest
+
+from velod.config import ImuSettings, Settings
+from velod.geometry.calibration import Calibration, Camera
+from velod.geometry.so3 import exp, hat
+from velod.optimizer.estimator import Estimator, Head
+from velod.optimizer.preintegration import preintegrate
+from velod.optimizer.window import HEAD, Window
+from velod.types import ImuSamples
+
+KNOT_NS = 100_000_000
+CAMERA = Camera(346, 260, 231.5, 231.5, 172.3, 130.8)
+CALIBRATION = Calibration(CAMERA, CAMERA, np.eye(3), np.array([-0.12, 0.0, 0.0]))
+
+
+def filled(segments, rng):
+    """A window that has lived through 12 segments with the same random factors, keeping ``segments`` of them."""
+    w = Window(ImuSettings(), KNOT_NS, segments, smoothness=0.5)
+    w.start(0)
+    for k in range(12):
+        if k:
+            w.extend(exp(rng.normal(size=3)) * 0.1, rng.normal(size=3) * 10, rng.normal(size=3) * 0.01, 0.1)
+        for _ in range(4):
+            t = int((k + rng.uniform(0, 1)) * KNOT_NS)
+            J = rng.normal(size=(8, 6))
+            w.add_information(t, J.T @ J, J.T @ rng.normal(size=8))
+    return w
+
+
+def test_marginalisation_equals_the_full_batch_solution():
+    whole, sliding = filled(12, np.random.default_rng(5)), filled(4, np.random.default_rng(5))
+    x, y = whole.solve([], None, 0.0), sliding.solve([], None, 0.0)
+    t = int(11.7 * KNOT_NS)
+    assert sliding.size < whole.size
+    assert np.allclose(whole.selector(t) @ x.x, sliding.selector(t) @ y.x, atol=1e-6)
+    P, Q = x.cov(whole.selector(t)), y.cov(sliding.selector(t))
+    assert np.abs((P - Q) / np.sqrt(np.outer(np.diag(P), np.diag(P)))).max() < 1e-4
+
+
+def test_the_window_keeps_its_size():
+    w = filled(4, np.random.default_rng(1))
+    assert (w.first, w.last) == (8, 11)
+    assert w.size == HEAD + 4 * 12
+    assert w.contains(8 * KNOT_NS)
+    assert not w.contains(8 * KNOT_NS - 1)
+
+
+def test_gravity_turns_in_L_as_the_error_of_the_gyroscope_says():
+    """d g_L / dt = [R_LB (b_w - b_used)]x g_L: the sign that Window.extend relies on, from exact rotations."""
+    rng = np.random.default_rng(2)
+    w, error, g_W = rng.normal(size=3), rng.normal(size=3) * 1e-3, np.array([0.0, 0.0, 9.81])
+    dt, R_LB, R_WB = 1e-4, np.eye(3), exp(rng.normal(size=3))
+    start = R_LB @ R_WB.T @ g_W
+    D_L = np.zeros((3, 3))
+    for _ in range(1000):
+        D_L += R_LB @ exp(0.5 * dt * w) * dt
+        R_LB = R_LB @ exp(dt * w)  # what the gyroscope says, less the bias that was used
+        R_WB = R_WB @ exp(dt * (w - error))  # the truth: b_w - b_used = error
+    change = R_LB @ R_WB.T @ g_W - start
+    assert np.linalg.norm(change) > 1e-4
+    assert np.allclose(change, np.cross(D_L @ error, start), atol=2e-2 * np.linalg.norm(change))
+
+
+@pytest.fixture(params=["error", "velocity"])
+def estimator(request):
+    """With 0.6 s of tumbling IMU samples, a window over them and a head with biases."""
+    settings = Settings()
+    object.__setattr__(settings.optimizer, "spline", request.param)
+    e = Estimator(settings, CALIBRATION)
+    rng = np.random.default_rng(7)
+    t = np.arange(121) * 5_000_000
+    w = 4 * np.sin(t[:, None] * 1e-9 * np.array([9.0, 7.0, 11.0])) + rng.normal(size=3)
+    a = 15 * np.cos(t[:, None] * 1e-9 * np.array([5.0, 8.0, 6.0])) + rng.normal(size=3)
+    e.add_imu(ImuSamples(0, int(t[-1]), 0, -1, 0, t, a, w))
+    e.memory.integrate_to(600_000_000, np.zeros(3), np.zeros(3))
+    e.window.start(0)
+    e._extend_to(250_000_000)
+    b_a, b_w = np.array([0.1, -0.2, 0.15]), np.array([0.02, -0.03, 0.01])
+    R_LB = e.memory.at(np.array([250_000_000]))[0][0]
+    g_L = np.array([1.0, -9.0, 3.0])
+    e.head = Head(250_000_000, np.array([3.0, -1.0, 2.0]), b_a, b_w, g_L, R_LB, np.eye(12) * 1e-4)
+    return e
+
+
+def residual(e, x, t_i, t_j):
+    """Eq. 14's inertial residual, exact in the states x of the window."""
+    w = e.window
+    _, N_i, M_i = e._frame(t_i)
+    _, N_j, M_j = e._frame(t_j)
+    c, b_a, b_w, g_L = np.split(w.selector(t_i) @ x, [3, 6, 9])
+    m = e.memory
+    p = preintegrate(m.t_ns, m.accel, m.gyro, t_i, t_j, b_a, b_w, 1.0, 1.0)
+    g_B = e._frame(t_i)[0].T @ g_L
+    v_i, v_j = N_i + M_i @ c, N_j + M_j @ (w.spline_row(t_j) @ x)
+    return p.beta - p.R_gamma @ v_j - g_B * p.dt + v_i
+
+
+def test_the_inertial_factor_is_the_derivative_of_the_residual(estimator):
+    e, (t_i, t_j) = estimator, (255_000_000, 280_000_000)
+    J, r, information = e._inertial_factor(t_i, t_j)
+    predicted, _ = e.predict(t_j)
+    F, G = e.window.selector(t_i), e.window.spline_row(t_j)
+    # a state at the factor's linearisation: biases of the head, velocity at t_j as predicted
+    _, N_j, M_j = e._frame(t_j)
+    x = F[3:6].T @ e.head.b_a + F[6:9].T @ e.head.b_w + F[9:12].T @ e.head.g_L
+    x = x + G.T @ np.linalg.solve(G @ G.T, np.linalg.solve(M_j, predicted - N_j))
+    assert np.allclose(J @ x - r, residual(e, x, t_i, t_j), atol=1e-9)
+    h = 1e-6
+    for column in np.flatnonzero(J.any(axis=0)):
+        d = np.zeros(len(x))
+        d[column] = h
+        numeric = (residual(e, x + d, t_i, t_j) - residual(e, x - d, t_i, t_j)) / (2 * h)
+        assert np.allclose(J[:, column], numeric, atol=1e-6), column
+    assert np.all(np.linalg.eigvalsh(information) > 0)
+
+
+def test_the_inertial_residual_closes_on_the_true_motion():
+    """Eq. 10 with beta rotated by R_WB_i: exact motion leaves no residual (DESIGN 4.1)."""
+    w_B, a_W, g_W = np.array([0.5, -2.0, 3.0]), np.array([2.0, -1.0, 4.0]), np.array([0.0, 0.0, 9.81])
+    t = np.arange(31) * 1_000_000
+    R_WB = [exp(w_B * ti * 1e-9) for ti in t]
+    v_B = [R.T @ (np.array([5.0, 1.0, -2.0]) + a_W * ti * 1e-9) for R, ti in zip(R_WB, t, strict=True)]
+    accel = np.array([R.T @ (a_W + g_W) for R in R_WB])
+    p = preintegrate(t, accel, np.tile(w_B, (31, 1)), 0, int(t[-1]), np.zeros(3), np.zeros(3), 1.0, 1.0)
+    r = p.beta - p.R_gamma @ v_B[-1] - R_WB[0].T @ g_W * p.dt + v_B[0]
+    assert np.linalg.norm(r) < 1e-6
+
+
+def test_the_covariance_carried_by_the_imu_is_that_of_its_jacobian(estimator):
+    e, t = estimator, 290_000_000
+    v, cov = e.predict(t)
+    head, h = e.head, 1e-6
+    J = np.zeros((3, 12))
+    start = np.concatenate([head.v_B, head.b_a, head.b_w, head.g_L])
+    for i in range(12):
+        sides = []
+        for sign in (1, -1):
+            x = start.copy()
+            x[i] += sign * h
+            e.head = Head(head.t_ns, x[:3], x[3:6], x[6:9], x[9:], head.R_LB, head.cov)
+            sides.append(e.predict(t)[0])
+        J[:, i] = (sides[0] - sides[1]) / (2 * h)
+    from_head = J @ head.cov @ J.T
+    p = preintegrate(e.memory.t_ns, e.memory.accel, e.memory.gyro, head.t_ns, t, head.b_a, head.b_w, 1.86e-2, 1.86e-3)
+    N = np.hstack([hat(v), p.R_gamma.T])
+    assert np.allclose(cov, from_head + N @ p.cov @ N.T, rtol=1e-5, atol=1e-12)
