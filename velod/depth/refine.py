@@ -1,0 +1,230 @@
+"""Plane-coincidence refinement: the sub-pixel disparity at which an edge reaches both cameras at the same time.
+
+The edge's passage is a plane on the surface of active events of each camera. At the coarse match the plane of the
+right camera is solved along the rectified row for the place where its time equals that of the left plane.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from velod.events.plane_fit import fit_plane
+from velod.geometry.rectify import Rectification
+from velod.types import F32, F64, I64, NS_PER_S, PATCH, U8, U16
+
+# Plane fits as for the flow (DESIGN recipe, step 2).
+_REJECT_PX = 1.0
+_REJECTIONS = 2
+_MIN_NEIGHBOURS = 20
+# Fewer on the right, whose patch is placed by a match that may be a pixel off: only its time is used, not its slope.
+_MIN_NEIGHBOURS_RIGHT = 15
+# Acceptance: the last step, the total way from the coarse match, the relative difference of slopes, the residual.
+_MAX_STEP_PX = 0.75
+_MAX_SHIFT_PX = 1.5
+_MAX_SLOPE_DIFFERENCE = 0.3
+_MAX_RMS_PX = 0.35
+_MAX_STEPS = 2
+# Edges flatter than this slide along the row: their place on it is not observed.
+MIN_NORMAL_X = 0.15
+
+REFINED, NO_SEED, NO_LEFT_PLANE, FLAT_EDGE, NO_RIGHT_PLANE, FAR, SLOPES, RESIDUAL = range(8)
+OUTCOMES = (
+    "refined",
+    "no seed",
+    "no left plane",
+    "flat edge",
+    "no right plane",
+    "too far",
+    "slopes differ",
+    "residual",
+)
+"""Names of the outcomes, in the order of their numbers."""
+
+
+@dataclass(frozen=True, slots=True)
+class Refined:
+    """Outcome of each point; the rest is NaN unless it is REFINED (normal_x: unless there is no left plane)."""
+
+    outcome: U8  # (n,)
+    disparity: F64  # (n,) px
+    normal_x: F64  # (n,) x of the rectified edge's unit normal, left
+    rms_px: F64  # (n,) residuals of both planes together, as a distance along their normals
+
+
+def refine(
+    left: U16,
+    right: U16,
+    unit_ns: int,
+    x: U16,
+    y: U16,
+    p: U8,
+    seed_px: F32,
+    rectification: Rectification,
+) -> Refined:
+    """Refine the disparities ``seed_px`` (n,) (NaN: none) of events at sensor pixels x, y with polarity p.
+
+    ``left`` and ``right`` (2, h, w) are first-of-burst surfaces on the sensor grids, ages in steps of ``unit_ns``.
+    """
+    n = x.shape[0]
+    out = Refined(np.empty(n, np.uint8), np.empty(n), np.empty(n), np.empty(n))
+    _refine(
+        left,
+        right,
+        unit_ns / NS_PER_S,
+        x.astype(np.int64),
+        y.astype(np.int64),
+        p.astype(np.int64),
+        seed_px,
+        rectification.left_xy,
+        rectification.left_covector,
+        rectification.right_covector,
+        rectification.remap_right[0],
+        rectification.remap_right[1],
+        np.empty(PATCH * PATCH),
+        out.outcome,
+        out.disparity,
+        out.normal_x,
+        out.rms_px,
+    )
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _patch(surface: U16, p: int, x: int, y: int, unit_s: float, age: F64) -> bool:
+    """Ages in s of the 5x5 neighbours of (x, y), 0 = none. False where they leave the sensor."""
+    if x < 2 or x >= surface.shape[2] - 2 or y < 2 or y >= surface.shape[1] - 2:
+        return False
+    for i in range(5):
+        for j in range(5):
+            age[5 * i + j] = surface[p, y + i - 2, x + j - 2] * unit_s
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _bilinear(table: F32, x: float, y: float) -> float:
+    """Value of a table (h, w) at (x, y); NaN outside."""
+    h, w = table.shape
+    if not (0.0 <= x <= w - 1 and 0.0 <= y <= h - 1):
+        return math.nan
+    i, j = min(int(y), h - 2), min(int(x), w - 2)
+    a, b = x - j, y - i
+    upper = (1.0 - a) * table[i, j] + a * table[i, j + 1]
+    lower = (1.0 - a) * table[i + 1, j] + a * table[i + 1, j + 1]
+    return float((1.0 - b) * upper + b * lower)
+
+
+@njit(cache=True, nogil=True)
+def _refine_one(
+    right: U16,
+    unit_s: float,
+    p: int,
+    x_left: float,
+    y_left: float,
+    seed: float,
+    t_left: float,
+    gx_left: float,
+    gy_left: float,
+    right_covector: F32,
+    map_x: F32,
+    map_y: F32,
+    age: F64,
+) -> tuple[int, float, float]:
+    """(outcome, disparity, rms of the right plane in px) from the left plane's time and rectified slope."""
+    x = x_left - seed
+    for _ in range(_MAX_STEPS):
+        sensor_x = _bilinear(map_x, x, y_left)
+        sensor_y = _bilinear(map_y, x, y_left)
+        if not (math.isfinite(sensor_x) and math.isfinite(sensor_y)):
+            return NO_RIGHT_PLANE, math.nan, math.nan
+        px, py = round(sensor_x), round(sensor_y)
+        if not _patch(right, p, px, py, unit_s, age):
+            return NO_RIGHT_PLANE, math.nan, math.nan
+        n, gx, gy, t0, rms, _qxx, _qxy, _qyy = fit_plane(age, _REJECT_PX, _REJECTIONS, _MIN_NEIGHBOURS_RIGHT)
+        if n == 0:
+            return NO_RIGHT_PLANE, math.nan, math.nan
+        M = right_covector[py, px]
+        gx_right = M[0, 0] * gx + M[0, 1] * gy
+        gy_right = M[1, 0] * gx + M[1, 1] * gy
+        # t_R(x + step) = t_L along the rectified row
+        t_right = t0 + gx * (sensor_x - px) + gy * (sensor_y - py)
+        step = (t_left - t_right) / gx_right if gx_right != 0.0 else math.inf
+        x += step
+        if not abs(x_left - x - seed) < _MAX_SHIFT_PX:
+            return FAR, math.nan, math.nan
+        if abs(step) < _MAX_STEP_PX:
+            slope = math.sqrt(gx_left * gx_left + gy_left * gy_left)
+            difference = math.sqrt((gx_right - gx_left) ** 2 + (gy_right - gy_left) ** 2)
+            rms_px = rms / math.sqrt(gx * gx + gy * gy)
+            if difference > _MAX_SLOPE_DIFFERENCE * slope:
+                return SLOPES, math.nan, math.nan
+            if rms_px > _MAX_RMS_PX:
+                return RESIDUAL, math.nan, math.nan
+            return REFINED, x_left - x, rms_px
+    return FAR, math.nan, math.nan
+
+
+@njit(cache=True, nogil=True)
+def _refine(
+    left: U16,
+    right: U16,
+    unit_s: float,
+    x: I64,
+    y: I64,
+    p: I64,
+    seed: F32,
+    left_xy: F32,
+    left_covector: F32,
+    right_covector: F32,
+    map_x: F32,
+    map_y: F32,
+    age: F64,
+    outcome: U8,
+    disparity: F64,
+    normal_x: F64,
+    rms_px: F64,
+) -> None:
+    for k in range(x.shape[0]):
+        xk, yk, pk = int(x[k]), int(y[k]), int(p[k])
+        disparity[k] = math.nan
+        normal_x[k] = math.nan
+        rms_px[k] = math.nan
+        outcome[k] = NO_LEFT_PLANE
+        if not _patch(left, pk, xk, yk, unit_s, age):
+            continue
+        n, gx, gy, t_left, rms, _qxx, _qxy, _qyy = fit_plane(age, _REJECT_PX, _REJECTIONS, _MIN_NEIGHBOURS)
+        if n == 0:
+            continue
+        M = left_covector[yk, xk]
+        gx_left = M[0, 0] * gx + M[0, 1] * gy
+        gy_left = M[1, 0] * gx + M[1, 1] * gy
+        slope = math.sqrt(gx_left * gx_left + gy_left * gy_left)
+        if not slope > 0.0:
+            continue
+        normal_x[k] = gx_left / slope
+        if not math.isfinite(seed[k]):
+            outcome[k] = NO_SEED
+            continue
+        if abs(normal_x[k]) < MIN_NORMAL_X:
+            outcome[k] = FLAT_EDGE
+            continue
+        outcome[k], disparity[k], right_rms_px = _refine_one(
+            right,
+            unit_s,
+            pk,
+            float(left_xy[yk, xk, 0]),
+            float(left_xy[yk, xk, 1]),
+            float(seed[k]),
+            t_left,
+            gx_left,
+            gy_left,
+            right_covector,
+            map_x,
+            map_y,
+            age,
+        )
+        # One age buffer serves both planes: the left one's numbers are already out of it.
+        rms_px[k] = math.sqrt((rms / math.sqrt(gx * gx + gy * gy)) ** 2 + right_rms_px**2)

@@ -1,0 +1,180 @@
+"""Sparse block matching of time surfaces along rectified rows by zero-normalised cross-correlation (ZNCC)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from velod.types import F32, F64, I64
+
+# A block whose variance is below this is flat: nothing to match.
+_FLAT = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class Surface:
+    """A time surface (h, w) with the integral images (h + 1, w + 1) of itself and of its square."""
+
+    values: F32
+    total: F64
+    total_of_squares: F64
+
+    @staticmethod
+    def of(values: F32) -> Surface:
+        total, squares = cv2.integral2(values, sdepth=cv2.CV_64F, sqdepth=cv2.CV_64F)
+        return Surface(values, np.asarray(total, dtype=np.float64), np.asarray(squares, dtype=np.float64))
+
+
+@dataclass(frozen=True, slots=True)
+class Matches:
+    """Best match of each point, NaN where its block or every candidate leaves the image, or is flat."""
+
+    disparity: F32  # (n,) px, sub-pixel
+    score: F32  # (n,) ZNCC of the best whole disparity, -1..1
+    second: F32  # (n,) ZNCC of the best one more than 2 px away, -1: none
+    enclosed: NDArray[np.bool_]  # (n,) the best has a neighbour on both sides: a real peak
+
+
+def match(
+    reference: Surface, mirrored_other: Surface, x: I64, y: I64, block_px: int, max_disparity_px: int
+) -> Matches:
+    """Match blocks centred at (x, y) of ``reference`` with those at (x - d, y) of the other camera, d = 0..max.
+
+    The other surface is mirrored left to right, so that disparity runs along memory. To match the other way, swap
+    and mirror: the mirrored right surface is the reference, its x is w - 1 - x, and the left one is as it is.
+    """
+    n = x.shape[0]
+    out = Matches(
+        np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, dtype=np.bool_)
+    )
+    half = block_px // 2
+    _match(
+        reference.values,
+        reference.total,
+        reference.total_of_squares,
+        mirrored_other.values,
+        mirrored_other.total,
+        mirrored_other.total_of_squares,
+        x,
+        y,
+        half,
+        max_disparity_px,
+        np.empty(max_disparity_px + 1, np.float32),
+        np.empty(block_px, np.float32),
+        out.disparity,
+        out.score,
+        out.second,
+        out.enclosed,
+    )
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _block_sum(total: F64, x: int, y: int, half: int) -> float:
+    """Sum over the block centred at (x, y) from an integral image."""
+    return float(
+        total[y + half + 1, x + half + 1]
+        - total[y - half, x + half + 1]
+        - total[y + half + 1, x - half]
+        + total[y - half, x - half]
+    )
+
+
+@njit(cache=True, nogil=True)
+def _correlate(
+    reference: F32, mirrored: F32, x: int, y: int, xm: int, half: int, mean: float, row: F32, out: F32
+) -> None:
+    """out[d] = sum over the block of (reference - mean) * other, for all d; ``xm`` is x in the mirrored surface."""
+    n = out.shape[0]
+    size = 2 * half + 1
+    mean32 = np.float32(mean)
+    out[:] = 0.0
+    for i in range(-half, half + 1):
+        for j in range(size):
+            row[j] = reference[y + i, x - half + j] - mean32
+        # Mirrored, the block's columns run backwards: column x + j - d lies at xm - j + d.
+        other = mirrored[y + i, xm - half : xm + half + n]
+        # Four columns at a time: a quarter of the loads and stores of out.
+        j = 0
+        while j + 4 <= size:
+            a, b, c, e = row[size - 1 - j], row[size - 2 - j], row[size - 3 - j], row[size - 4 - j]
+            o0, o1, o2, o3 = (
+                other[j : j + n],
+                other[j + 1 : j + 1 + n],
+                other[j + 2 : j + 2 + n],
+                other[j + 3 : j + 3 + n],
+            )
+            for d in range(n):
+                out[d] += a * o0[d] + b * o1[d] + c * o2[d] + e * o3[d]
+            j += 4
+        while j < size:
+            a = row[size - 1 - j]
+            o0 = other[j : j + n]
+            for d in range(n):
+                out[d] += a * o0[d]
+            j += 1
+
+
+@njit(cache=True, nogil=True)
+def _match(
+    reference: F32,
+    total: F64,
+    squares: F64,
+    mirrored: F32,
+    mirrored_total: F64,
+    mirrored_squares: F64,
+    x: I64,
+    y: I64,
+    half: int,
+    max_disparity: int,
+    scores: F32,
+    row: F32,
+    disparity: F32,
+    score: F32,
+    second: F32,
+    enclosed: NDArray[np.bool_],
+) -> None:
+    h, w = reference.shape
+    area = (2 * half + 1) ** 2
+    for k in range(x.shape[0]):
+        xk, yk = int(x[k]), int(y[k])
+        disparity[k] = np.nan
+        score[k] = np.nan
+        second[k] = -1.0
+        enclosed[k] = False
+        # The block must lie inside at x and at x - d.
+        if xk < half or xk >= w - half or yk < half or yk >= h - half:
+            continue
+        sum_l = _block_sum(total, xk, yk, half)
+        var_l = _block_sum(squares, xk, yk, half) - sum_l * sum_l / area
+        if var_l < _FLAT * area:
+            continue
+        xm = w - 1 - xk
+        n = min(max_disparity, xk - half) + 1
+        _correlate(reference, mirrored, xk, yk, xm, half, sum_l / area, row, scores[:n])
+        best = 0
+        for d in range(n):
+            sum_r = _block_sum(mirrored_total, xm + d, yk, half)
+            var_r = _block_sum(mirrored_squares, xm + d, yk, half) - sum_r * sum_r / area
+            scores[d] = (
+                scores[d] / np.float32(math.sqrt(var_l * var_r)) if var_r >= _FLAT * area else np.float32(-1.0)
+            )
+            if scores[d] > scores[best]:
+                best = d
+        score[k] = scores[best]
+        for d in range(n):
+            if abs(d - best) > 2 and scores[d] > second[k]:
+                second[k] = scores[d]
+        offset = np.float32(0.0)
+        if 0 < best < n - 1:
+            enclosed[k] = True
+            before, at, after = scores[best - 1], scores[best], scores[best + 1]
+            curvature = before - np.float32(2.0) * at + after
+            if curvature < 0.0:
+                offset = np.float32(0.5) * (before - after) / curvature
+        disparity[k] = best + offset
