@@ -1,0 +1,400 @@
+"""The command line: what people type. Each command loads what it needs, and only when it runs."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+
+from velod import __version__
+
+EXIT_FAILED = 1  # the run went wrong, or its result is not good enough
+EXIT_USAGE = 2  # the user can put it right: a file, a setting, a port
+EXIT_INTERRUPTED = 130
+
+LOCAL = "tcp/127.0.0.1:17447"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; the exit code. What a user can put right is one line on stderr, never a traceback."""
+    args = _parser().parse_args(argv)
+    command: Callable[[argparse.Namespace], int] = args.command
+    try:
+        return command(args)
+    except KeyboardInterrupt:
+        print("velod: interrupted", file=sys.stderr)
+        return EXIT_INTERRUPTED
+    except BrokenPipeError:
+        # The reader of the pipe (head, less) has seen enough. Python's own flush at exit must not complain again.
+        sys.stdout = None  # type: ignore[assignment]
+        return 0
+    except (ValueError, OSError) as e:
+        # ConfigError, CalibrationError, RecordingError and SessionError are of these kinds.
+        print(f"velod: error: {_one_line(e)}", file=sys.stderr)
+        return EXIT_USAGE
+
+
+def _one_line(e: Exception) -> str:
+    if isinstance(e, OSError) and e.strerror and e.filename is not None:
+        return f"{e.filename}: {e.strerror}"
+    return " ".join(str(e).split()) or type(e).__name__
+
+
+# --- the commands ---
+
+
+def _demo(args: argparse.Namespace) -> int:
+    from velod.cli_play import demo
+
+    return demo(args.config, args.sequence, args.seconds, args.seed, args.csv, args.json)
+
+
+def _run(args: argparse.Namespace) -> int:
+    from velod.cli_run import run
+
+    return run(args.config, args.only, args.connect, args.worker)
+
+
+def _replay(args: argparse.Namespace) -> int:
+    from velod.cli_play import replay
+
+    return replay(args.config, args.file, _play_options(args), args.csv)
+
+
+def _eval(args: argparse.Namespace) -> int:
+    from velod.cli_play import evaluate_files
+
+    return evaluate_files(args.config, args.files, _play_options(args), args.json, args.plot)
+
+
+def _play_options(args: argparse.Namespace) -> object:
+    from velod.cli_play import PlayOptions
+
+    return PlayOptions(offline=args.offline, speed=args.speed, packets=args.packets, format=args.format)
+
+
+def _sim(args: argparse.Namespace) -> int:
+    from velod.cli_play import simulate_to_file
+
+    return simulate_to_file(args.sequence, args.output, args.seconds, args.seed)
+
+
+def _echo(args: argparse.Namespace) -> int:
+    from velod.cli_watch import echo
+
+    return echo(args.config, args.topic, args.connect, args.rig, args.count, args.timeout)
+
+
+def _top(args: argparse.Namespace) -> int:
+    from velod.cli_watch import top
+
+    return top(args.config, args.connect, args.rig, once=args.once)
+
+
+def _config_show(args: argparse.Namespace) -> int:
+    from velod.cli_config import show
+
+    return show(args.config)
+
+
+def _config_init(args: argparse.Namespace) -> int:
+    from velod.cli_config import init
+
+    return init(args.file, force=args.force)
+
+
+def _config_check(args: argparse.Namespace) -> int:
+    from velod.cli_config import check
+
+    return check(args.file)
+
+
+def _config_calibration(args: argparse.Namespace) -> int:
+    from velod.cli_config import calibration
+
+    return calibration(args.file)
+
+
+def _warmup(args: argparse.Namespace) -> int:
+    from velod.cli_run import warmup
+
+    return warmup()
+
+
+# --- the parser ---
+
+_SEQUENCES = "corridor-1..3, boxes-4..5, spin-1..3 (Table I of the paper)"
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _plain(
+        argparse.ArgumentParser,
+        prog="velod",
+        description="Stereo events and an IMU in; metric body-frame velocity with its covariance out.",
+        epilog="""\
+first steps:
+  velod demo                         see it run on simulated sensors, judged against the truth
+  velod replay recording.h5          a recording through the same processes, in real time
+  velod eval recording.h5 --offline  how good it is, where the recording holds the truth
+  velod run -c velod.toml            the service beside a sensor driver
+  velod echo                         what it says, from another terminal
+`velod COMMAND --help` has worked examples for each command.""",
+    )
+    parser.add_argument("--version", action="version", version=f"velod {__version__}")
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    for add in (_add_demo, _add_run, _add_replay, _add_eval, _add_sim, _add_echo, _add_top, _add_config, _add_warmup):
+        add(commands)
+    return parser
+
+
+_Commands = argparse._SubParsersAction  # argparse has no public name for it
+
+
+def _plain(factory: Callable[..., argparse.ArgumentParser], *args: str, **kwargs: str) -> argparse.ArgumentParser:
+    """A parser that keeps the line breaks of its texts."""
+    return factory(*args, formatter_class=argparse.RawDescriptionHelpFormatter, **kwargs)
+
+
+def _command(
+    commands: _Commands[argparse.ArgumentParser],
+    name: str,
+    function: Callable[[argparse.Namespace], int],
+    summary: str,
+    text: str,
+    examples: str,
+) -> argparse.ArgumentParser:
+    parser = _plain(
+        commands.add_parser, name, help=summary, description=f"{summary}\n\n{text}", epilog=f"examples:\n{examples}"
+    )
+    parser.set_defaults(command=function)
+    return parser
+
+
+def _add_config_option(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("-c", "--config", metavar="FILE", help="settings (TOML); `velod config init` writes one")
+
+
+def _add_play_options(parser: argparse.ArgumentParser) -> None:
+    _add_config_option(parser)
+    parser.add_argument("--offline", action="store_true", help="in one process, as fast as it goes; the same numbers")
+    parser.add_argument(
+        "--speed",
+        type=_speed,
+        default=1.0,
+        metavar="X|max",
+        help="times real time (default 1); max: as fast as it goes without losing anything",
+    )
+    parser.add_argument(
+        "--packets",
+        default="200hz",
+        metavar="HOW",
+        help="how the driver cuts the stream: 200hz, 1000hz, 60hz, random, random:SEED (default 200hz)",
+    )
+    parser.add_argument(
+        "--format", choices=("sequence", "dsec", "text"), help="of the recording (default: from what is there)"
+    )
+
+
+def _add_watch_options(parser: argparse.ArgumentParser) -> None:
+    _add_config_option(parser)
+    parser.add_argument("--connect", metavar="ENDPOINT", help=f"where velod runs (default {LOCAL})")
+    parser.add_argument("--rig", metavar="NAME", help="name of the rig (default rig0)")
+
+
+def _add_demo(commands: _Commands[argparse.ArgumentParser]) -> None:
+    parser = _command(
+        commands,
+        "demo",
+        _demo,
+        "Simulated sensors through the whole service, judged against the truth.",
+        "Simulates a sequence (once; it is kept), plays it in real time from a driver process of its own, as a\n"
+        "camera would be, and ends with the error against the simulated truth, rate and latency.\n"
+        "Exits with 1 if the result is not as it should be.",
+        "  velod demo                            about 20 s of the default sequence\n"
+        "  velod demo --seconds 5 --csv out.csv  shorter; every velocity into a file\n"
+        "  velod demo --sequence boxes-4         a room of boxes instead of the corridor",
+    )
+    _add_config_option(parser)
+    parser.add_argument("--seconds", type=_seconds, default=20.0, help="of sensor time (default 20)")
+    parser.add_argument("--sequence", default="corridor-1", help=f"{_SEQUENCES} (default corridor-1)")
+    parser.add_argument("--seed", type=int, default=1, help="of the simulated noise (default 1)")
+    parser.add_argument("--csv", metavar="OUT", help="write every velocity")
+    parser.add_argument("--json", metavar="OUT", help="write the result; - for stdout")
+
+
+def _add_run(commands: _Commands[argparse.ArgumentParser]) -> None:
+    parser = _command(
+        commands,
+        "run",
+        _run,
+        "The service beside a sensor driver: ingest, flow, depth, optimizer.",
+        "Starts the processes, starts dead ones again, and ends them all on Ctrl-C or SIGTERM. A driver publishes\n"
+        "velod/<rig>/sensor/events/<left|right> and velod/<rig>/sensor/imu (docs/driver.md).",
+        "  velod run -c velod.toml                       everything on this host\n"
+        "  velod run --only flow --connect tcp/10.0.0.5:17447 --worker flow-1\n"
+        "                                                one more flow worker, for a velod on 10.0.0.5\n"
+        "  velod run -c velod.toml --only ingest,optimizer\n"
+        "                                                only these here; flow and depth run elsewhere",
+    )
+    _add_config_option(parser)
+    parser.add_argument("--only", type=_stages, metavar="STAGE[,STAGE]", help="only these stages on this host")
+    parser.add_argument("--connect", metavar="ENDPOINT", help="join the velod there; settings come from it")
+    parser.add_argument("--worker", metavar="NAME", help="name of the worker, with one stage in --only (flow-1)")
+
+
+def _add_replay(commands: _Commands[argparse.ArgumentParser]) -> None:
+    parser = _command(
+        commands,
+        "replay",
+        _replay,
+        "A recording through the same processes that run beside a sensor.",
+        "Reads velod's sequence files (HDF5), DSEC directories and the text format of the Event-Camera Dataset.",
+        "  velod replay recording.h5                      in real time, with a live line\n"
+        "  velod replay recording.h5 --speed max          as fast as it goes, nothing lost\n"
+        "  velod replay recording.h5 --offline --csv v.csv\n"
+        "                                                 in one process, every velocity into a file",
+    )
+    parser.add_argument("file", metavar="FILE", help="recording (file or directory)")
+    _add_play_options(parser)
+    parser.add_argument("--csv", metavar="OUT", help="write every velocity")
+
+
+def _add_eval(commands: _Commands[argparse.ArgumentParser]) -> None:
+    parser = _command(
+        commands,
+        "eval",
+        _eval,
+        "Error against the truth in the file, and latency.",
+        "AVE: mean of |v_gt - v_est| over every velocity from the first valid one on; RVE: the same, relative\n"
+        "(Eq. 16). The estimator is given none of the truth. Exits with 1 where a file yields no valid velocity.",
+        "  velod eval boxes.h5 --offline               a table\n"
+        "  velod eval a.h5 b.h5 --offline --json -     a list of results as JSON on stdout\n"
+        "  velod eval boxes.h5 --plot pictures/        velocity and error over time as PNG (needs velod[plot])",
+    )
+    parser.add_argument("files", nargs="+", metavar="FILE", help="recordings that hold the truth")
+    _add_play_options(parser)
+    parser.add_argument("--json", metavar="OUT", help="write the results; - for stdout")
+    parser.add_argument("--plot", metavar="DIR", help="write pictures")
+
+
+def _add_sim(commands: _Commands[argparse.ArgumentParser]) -> None:
+    parser = _command(
+        commands,
+        "sim",
+        _sim,
+        "Simulate a recording: stereo events, IMU, truth.",
+        f"SEQUENCE: {_SEQUENCES}.",
+        "  velod sim corridor-1 -o corridor.h5 --seconds 5\n"
+        "  velod sim boxes-4 -o boxes.h5 --seed 7 && velod eval boxes.h5 --offline",
+    )
+    parser.add_argument("sequence", metavar="SEQUENCE")
+    parser.add_argument("-o", "--output", required=True, metavar="FILE", help="HDF5 file to write")
+    parser.add_argument("--seconds", type=_seconds, default=5.0, help="of sensor time (default 5)")
+    parser.add_argument("--seed", type=int, default=1, help="of the noise (default 1)")
+
+
+def _add_echo(commands: _Commands[argparse.ArgumentParser]) -> None:
+    parser = _command(
+        commands,
+        "echo",
+        _echo,
+        "Print messages as they come.",
+        "Topics: velocity, health, flow, depth, imu, events, imu_sensor, done. Arrays are shown by shape and range.",
+        "  velod echo                            velocities of the velod on this host\n"
+        "  velod echo health -n 4                four health messages, then stop\n"
+        "  velod echo velocity --connect tcp/10.0.0.5:17447",
+    )
+    parser.add_argument("topic", nargs="?", default="velocity", metavar="TOPIC")
+    _add_watch_options(parser)
+    parser.add_argument("-n", "--count", type=int, metavar="N", help="stop after N messages")
+    parser.add_argument(
+        "--timeout", type=_seconds, metavar="S", help="give up after S seconds without a message (default: never)"
+    )
+
+
+def _add_top(commands: _Commands[argparse.ArgumentParser]) -> None:
+    parser = _command(
+        commands,
+        "top",
+        _top,
+        "A live table of the processes: rates, latency, drops, gaps, alarms.",
+        "From the health message that every process sends once a second, and from who is alive.",
+        "  velod top\n"
+        "  velod top --once                      one table, for a log; exits with 1 if nobody answers\n"
+        "  velod top --connect tcp/10.0.0.5:17447 --rig drone",
+    )
+    _add_watch_options(parser)
+    parser.add_argument("--once", action="store_true", help="print one table and stop")
+
+
+def _add_config(commands: _Commands[argparse.ArgumentParser]) -> None:
+    parser = _plain(
+        commands.add_parser,
+        "config",
+        help="Settings and calibration: show, init, check, calibration.",
+        description="Settings and calibration files. What is wrong is refused with file, key and reason.",
+        epilog="""\
+examples:
+  velod config init velod.toml            all settings with their meaning and defaults
+  velod config check velod.toml           whether velod would take it
+  velod config show -c velod.toml         the settings in effect
+  velod config calibration camchain.yaml  read a calibration (velod, Kalibr, ROS) and show it as velod's YAML""",
+    )
+    actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
+    show = actions.add_parser("show", help="print the settings in effect")
+    _add_config_option(show)
+    show.set_defaults(command=_config_show)
+    init = actions.add_parser("init", help="write all settings with their meaning and defaults")
+    init.add_argument("file", metavar="FILE", nargs="?", default="velod.toml")
+    init.add_argument("--force", action="store_true", help="overwrite an existing file")
+    init.set_defaults(command=_config_init)
+    check = actions.add_parser("check", help="whether velod would take a settings file")
+    check.add_argument("file", metavar="FILE")
+    check.set_defaults(command=_config_check)
+    calibration = actions.add_parser("calibration", help="read a calibration and show it as velod's YAML")
+    calibration.add_argument("file", metavar="FILE")
+    calibration.set_defaults(command=_config_calibration)
+
+
+def _add_warmup(commands: _Commands[argparse.ArgumentParser]) -> None:
+    _command(
+        commands,
+        "warmup",
+        _warmup,
+        "Compile the numerical kernels now, so that the first run need not.",
+        "The compiled kernels are kept beside the package, or under NUMBA_CACHE_DIR.",
+        "  velod warmup                          after installing, or when building an image",
+    )
+
+
+# --- values ---
+
+
+def _speed(text: str) -> float:
+    """Times real time; infinity for ``max``."""
+    if text == "max":
+        return float("inf")
+    return _seconds(text)
+
+
+def _seconds(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"not a number: {text!r}") from None
+    if not 0.0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"must be positive and finite, got {text}")
+    return value
+
+
+def _stages(text: str) -> list[str]:
+    known = ("ingest", "flow", "depth", "optimizer")
+    stages = text.split(",")
+    for stage in stages:
+        if stage not in known:
+            raise argparse.ArgumentTypeError(f"no stage {stage!r}; stages: {', '.join(known)}")
+    return stages
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,53 @@
+"""``velod config``: settings and calibration files."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from velod import config
+from velod.config import ConfigError, Settings
+
+
+def settings_of(path: str | None) -> Settings:
+    """The settings of a file, or the defaults. Raises ConfigError."""
+    return Settings() if path is None else config.load(path)
+
+
+def show(path: str | None) -> int:
+    """Print the settings in effect, as TOML."""
+    sys.stdout.write(config.to_toml(settings_of(path), explain=False))
+    return 0
+
+
+def init(path: str, *, force: bool) -> int:
+    """Write all settings with their meaning; refuses to overwrite a file unless ``force``."""
+    text = config.to_toml(Settings())
+    try:
+        with Path(path).open("w" if force else "x", encoding="utf-8") as f:
+            f.write(text)
+    except FileExistsError:
+        raise ConfigError(f"{path}: exists already; --force overwrites it") from None
+    print(f"wrote {path}")
+    return 0
+
+
+def check(path: str) -> int:
+    """Say whether velod would take a settings file, and the calibration that it names."""
+    settings = config.load(path)
+    if settings.rig.calibration:
+        from velod.geometry.calibration import load_calibration
+
+        load_calibration(settings.rig.calibration)
+    print(f"{path}: good")
+    return 0
+
+
+def calibration(path: str) -> int:
+    """Read a calibration of any known kind and print it as velod's own YAML."""
+    import yaml
+
+    from velod.geometry.calibration import load_calibration
+
+    yaml.safe_dump(load_calibration(path).to_tree(), sys.stdout, sort_keys=False)
+    return 0

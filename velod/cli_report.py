@@ -1,0 +1,139 @@
+"""What the commands show and write: a live line, a progress bar, CSV and JSON files."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import sys
+import time
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, TextIO
+
+import numpy as np
+
+from velod.types import EventPacket, ImuPacket, Velocity
+
+CSV_COLUMNS = (
+    *("t_ns", "vx", "vy", "vz"),
+    *("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz"),
+    *("state", "valid", "age_ms"),
+)
+"""Velocity in m/s in B, covariance in (m/s)^2; age_ms: how far the IMU carried the newest measurement."""
+
+_REDRAW_S = 0.1
+_UPPER = np.triu_indices(3)
+
+
+def write_csv(path: str, velocities: Sequence[Velocity]) -> None:
+    """One line per velocity; numbers that read back exactly; ``age_ms`` is empty before the first batch."""
+    with Path(path).open("w", newline="", encoding="utf-8") as f:
+        writer = csv.writer(f)
+        writer.writerow(CSV_COLUMNS)
+        for v in velocities:
+            age_ms = "" if v.batch_seq < 0 else repr((v.t_ns - v.batch_t_ns) / 1e6)
+            numbers = [repr(float(a)) for a in (*v.v_B, *v.cov[_UPPER])]
+            writer.writerow([v.t_ns, *numbers, v.state, int(v.valid), age_ms])
+
+
+def write_json(path: str, value: Any) -> None:
+    """JSON into a file, or onto stdout for ``-``. NaN is refused: the caller writes null."""
+    text = json.dumps(value, indent=2, allow_nan=False) + "\n"
+    if path == "-":
+        sys.stdout.write(text)
+    else:
+        Path(path).write_text(text, encoding="utf-8")
+
+
+class Line:
+    """One line of a terminal that is drawn over and over; silent where the stream is not a terminal."""
+
+    def __init__(self, stream: TextIO | None = None) -> None:
+        self._stream = sys.stderr if stream is None else stream
+        self.enabled = self._stream.isatty()
+        self._next_s = 0.0
+        self._drawn = False
+
+    def due(self) -> bool:
+        """Whether it is time to draw again."""
+        return self.enabled and time.monotonic() >= self._next_s
+
+    def draw(self, text: str) -> None:
+        self._next_s = time.monotonic() + _REDRAW_S
+        self._drawn = True
+        self._stream.write(f"\r\x1b[K{text}")
+        self._stream.flush()
+
+    def finish(self) -> None:
+        """Leave the last state on the screen and go to the next line."""
+        if self._drawn:
+            self._stream.write("\n")
+            self._stream.flush()
+            self._drawn = False
+
+
+class VelocityLine:
+    """The live line of a run: rate, speed with its sigma, latency and state."""
+
+    def __init__(self) -> None:
+        self._line = Line()
+        self._times_s: deque[float] = deque(maxlen=75)
+
+    def show(self, v: Velocity, latency_ms: float) -> None:
+        self._times_s.append(time.monotonic())
+        if self._line.due():
+            self._line.draw(describe_velocity(v, self._rate_hz(), latency_ms))
+
+    def finish(self) -> None:
+        self._line.finish()
+
+    def _rate_hz(self) -> float:
+        span_s = self._times_s[-1] - self._times_s[0]
+        return (len(self._times_s) - 1) / span_s if span_s > 0.0 else math.nan
+
+
+def describe_velocity(v: Velocity, rate_hz: float = math.nan, latency_ms: float = math.nan) -> str:
+    """One line for people, e.g. ``t  12.345 s  |v|  5.678 +- 0.031 m/s  [...]  75.0 Hz  8.1 ms  tracking``."""
+    parts = [f"t {v.t_ns * 1e-9:9.3f} s"]
+    if v.valid:
+        speed, sigma = speed_and_sigma(v)
+        parts.append(f"|v| {speed:6.3f} ± {sigma:.3f} m/s  [{v.v_B[0]:+.3f} {v.v_B[1]:+.3f} {v.v_B[2]:+.3f}]")
+    else:
+        parts.append("|v|    --")
+    if math.isfinite(rate_hz):
+        parts.append(f"{rate_hz:5.1f} Hz")
+    if math.isfinite(latency_ms):
+        parts.append(f"{latency_ms:5.1f} ms")
+    parts.append(f"{v.state}: {v.reason}" if v.reason else str(v.state))
+    return "  ".join(parts)
+
+
+def speed_and_sigma(v: Velocity) -> tuple[float, float]:
+    """|v| and its standard deviation to first order, m/s."""
+    speed = float(np.linalg.norm(v.v_B))
+    along = v.v_B / speed if speed > 1e-9 else np.full(3, math.sqrt(1.0 / 3.0))
+    return speed, math.sqrt(max(0.0, float(along @ v.cov @ along)))
+
+
+def with_progress(
+    packets: Iterable[EventPacket | ImuPacket], t_start_ns: int, t_end_ns: int
+) -> Iterator[EventPacket | ImuPacket]:
+    """The packets, while a bar on stderr shows how far into the recording they are."""
+    line = Line()
+    start_s = time.monotonic()
+    for packet in packets:
+        yield packet
+        if line.due():
+            done_ns = min(packet.t_ns, t_end_ns) - t_start_ns
+            line.draw(progress_bar(done_ns / max(1, t_end_ns - t_start_ns), time.monotonic() - start_s))
+    line.finish()
+
+
+def progress_bar(share: float, elapsed_s: float, width: int = 40) -> str:
+    """``[#####.....]  50 %  12 s left``"""
+    share = min(1.0, max(0.0, share))
+    filled = round(share * width)
+    left = f"{elapsed_s / share - elapsed_s:4.0f} s left" if share > 0.02 else ""
+    return f"[{'#' * filled}{'.' * (width - filled)}] {100.0 * share:3.0f} %  {left}".rstrip()

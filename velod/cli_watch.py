@@ -1,0 +1,169 @@
+"""``velod echo`` and ``velod top``: look at a running velod from outside."""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from velod.cli_config import settings_of
+from velod.cli_report import describe_velocity
+from velod.client import Listener, Received
+from velod.runtime.session import introducer_endpoint
+from velod.types import Health, Velocity
+from velod.wire.topics import HEALTH, TOPICS
+
+_CLEAR_SCREEN = "\x1b[H\x1b[2J"
+_REFRESH_S = 1.0
+_DISCOVERY_S = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Which velod: its rig's name and where to reach it."""
+
+    rig: str
+    connect: str
+
+
+def place_of(config: str | None, connect: str | None, rig: str | None) -> Place:
+    """From the settings file, unless said otherwise. Raises ConfigError."""
+    settings = settings_of(config)
+    return Place(rig or settings.rig.name, connect or introducer_endpoint(settings.zenoh))
+
+
+def echo(
+    config: str | None,
+    topic: str,
+    connect: str | None,
+    rig: str | None,
+    count: int | None,
+    timeout_s: float | None,
+) -> int:
+    """Print the messages of a topic; 1 if ``timeout_s`` passes without one."""
+    readable = [t.name for t in TOPICS.values() if t.message is not None]
+    if topic not in readable:
+        raise ValueError(f"no topic {topic!r} to print; topics: {', '.join(readable)}")
+    place = place_of(config, connect, rig)
+    with Listener(place.rig, (TOPICS[topic],), place.connect) as listener:
+        printed = 0
+        while count is None or printed < count:
+            received = listener.receive(math.inf if timeout_s is None else timeout_s)
+            if received is None:
+                print(f"velod: no {topic} of rig {place.rig} in {timeout_s:g} s ({place.connect})", file=sys.stderr)
+                return 1
+            print(describe(received), flush=True)
+            printed += 1
+    return 0
+
+
+def describe(received: Received) -> str:
+    """One line for one message: velocities in words, others field by field."""
+    message = received.envelope.message
+    if isinstance(message, Velocity):
+        return describe_velocity(message, latency_ms=origin_latency_ms(received))
+    shown = " ".join(f"{f.name}={_value(getattr(message, f.name))}" for f in fields(message))
+    return f"{type(message).__name__} {shown}"
+
+
+def origin_latency_ms(received: Received) -> float:
+    """From the closing of the batch to the publication of the velocity, ms; NaN where there was no batch."""
+    envelope = received.envelope
+    return (envelope.t_pub_ns - envelope.t_origin_ns) * 1e-6 if envelope.t_origin_ns > 0 else math.nan
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, np.ndarray):
+        spread = f"{value.min():g}..{value.max():g}" if value.size else "-"
+        return f"{value.dtype}{list(value.shape)}({spread})"
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{k}: {v:g}" if isinstance(v, float) else f"{k}: {v}" for k, v in value.items()) + "}"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def top(config: str | None, connect: str | None, rig: str | None, *, once: bool) -> int:
+    """The table of processes, drawn once a second; with ``once`` printed one time, 1 if nobody answers."""
+    place = place_of(config, connect, rig)
+    with Listener(place.rig, (HEALTH,), place.connect) as listener:
+        newest: dict[str, Received] = {}
+        if once:
+            _collect(listener, newest, _DISCOVERY_S, until_complete=True)
+            print(table(place, newest, listener.alive()))
+            return 0 if newest else 1
+        while True:
+            _collect(listener, newest, _REFRESH_S, until_complete=False)
+            sys.stdout.write(f"{_CLEAR_SCREEN}{table(place, newest, listener.alive())}\n")
+            sys.stdout.flush()
+
+
+def _collect(listener: Listener, newest: dict[str, Received], seconds: float, *, until_complete: bool) -> None:
+    """Take in health messages for a while, or until everyone who is alive has spoken."""
+    end_s = time.monotonic() + seconds
+    while (left_s := end_s - time.monotonic()) > 0.0:
+        received = listener.receive(min(0.2, left_s))
+        if received is not None and isinstance(received.envelope.message, Health):
+            newest[received.envelope.message.worker] = received
+        elif until_complete and newest and {worker for _, worker in listener.alive()} <= set(newest):
+            return
+
+
+_HEADER = (
+    f"{'worker':<14}{'state':<8}{'pid@host':<22}{'up s':>8}{'in/s':>8}{'out/s':>8}"
+    f"{'p50 ms':>8}{'p99 ms':>8}{'gaps':>7}{'drops':>7}"
+)
+
+
+def table(place: Place, newest: dict[str, Received], alive: list[tuple[str, str]]) -> str:
+    """The table as text: a line per process, the drops by cause, the alarms."""
+    workers = {worker for _, worker in alive}
+    lines = [f"velod rig {place.rig} at {place.connect}", _HEADER]
+    for worker in sorted(set(newest) | workers):
+        lines += _lines(worker, newest.get(worker), worker in workers)
+    if len(lines) == 2:
+        lines.append("nobody there")
+    return "\n".join(lines)
+
+
+def _lines(worker: str, received: Received | None, alive: bool) -> list[str]:
+    if received is None:
+        return [f"{worker:<14}{'silent':<8}"]
+    h = received.envelope.message
+    assert isinstance(h, Health)
+    stale = (time.time_ns() - received.t_received_ns) * 1e-9 > HEALTH.stale_after_s
+    # The supervisor and drivers hold no token; for them recent health is life enough.
+    state = "stale" if stale else "up" if alive or h.stage not in ("ingest", "flow", "depth", "optimizer") else "gone"
+    name, p50, p99 = _main_latency(h)
+    gaps, drops = losses(h.counters)
+    line = (
+        f"{worker:<14}{state:<8}{f'{h.pid}@{h.host}'[:21]:<22}{h.uptime_s:8.0f}{_rate(h, 'in.'):8.1f}"
+        f"{_rate(h, 'out.'):8.1f}{p50:>8}{p99:>8}{sum(gaps.values()):7d}{sum(drops.values()):7d}  {name}".rstrip()
+    )
+    notes = [f"    {cause}: {n}" for cause, n in sorted({**gaps, **drops}.items()) if n]
+    alarms = [f"    ALARM {alarm}: {what}" for alarm, what in sorted(h.alarms.items())]
+    return [line, *notes, *alarms]
+
+
+def _main_latency(h: Health) -> tuple[str, str, str]:
+    """Name, p50 and p99 of the latency to show: end to end where there is one, else the first."""
+    names = sorted({name.rpartition("_")[0] for name in h.latency_ms}, key=lambda n: (n != "end_to_end", n))
+    for name in names:
+        if f"{name}_p50" in h.latency_ms and f"{name}_p99" in h.latency_ms:
+            return name, f"{h.latency_ms[f'{name}_p50']:.2f}", f"{h.latency_ms[f'{name}_p99']:.2f}"
+    return "", "-", "-"
+
+
+def _rate(h: Health, prefix: str) -> float:
+    return sum(rate for name, rate in h.rates.items() if name.startswith(prefix))
+
+
+def losses(counters: dict[str, int]) -> tuple[dict[str, int], dict[str, int]]:
+    """The gaps and the drops among a process's counters; what came in and went out is neither."""
+    gaps = {name: n for name, n in counters.items() if name.startswith("gap.")}
+    drops = {
+        name: n for name, n in counters.items() if name not in gaps and not name.startswith(("in.", "out.", "done."))
+    }
+    return gaps, drops

@@ -1,0 +1,189 @@
+"""Receive what velod publishes: five lines to a stream of velocities.
+
+>>> from velod.client import VelocityClient
+>>> with VelocityClient("rig0", connect="tcp/127.0.0.1:17447") as client:
+...     for velocity in client:
+...         print(velocity.t_ns, velocity.v_B)
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, Self
+
+from velod.config import ZenohSettings
+from velod.runtime.inbox import Inbox
+from velod.runtime.measure import GapCounter
+from velod.runtime.session import open_session
+from velod.types import Velocity
+from velod.wire import Envelope, WireError, decode
+from velod.wire.topics import ALIVE, DEPTH, DONE, FLOW, VELOCITY, Topic, key, parts
+
+LOCAL = "tcp/127.0.0.1:17447"
+"""Where a velod with default settings is found from its own host."""
+
+_POLL_S = 0.5
+# Several workers publish on these keys, and batches overtake each other.
+_OVERTAKING = {FLOW.name: 16, DEPTH.name: 16, DONE.name: 16}
+
+
+@dataclass(frozen=True, slots=True)
+class Received:
+    """One message as it came in."""
+
+    topic: Topic
+    key: str
+    envelope: Envelope
+    t_received_ns: int  # host clock
+    n_bytes: int
+
+    @property
+    def age_s(self) -> float:
+        """From publication to arrival, by the host clocks; across hosts these must be synchronised (PTP, NTP)."""
+        return (self.t_received_ns - self.envelope.t_pub_ns) * 1e-9
+
+
+class Listener:
+    """Messages of any topics of one rig. A context manager; nothing is received outside it.
+
+    The connection is made, and made again after a loss, in the background. Each topic keeps the newest
+    ``topic.qos.depth`` messages.
+    """
+
+    def __init__(self, rig: str, topics: tuple[Topic, ...], connect: str = LOCAL) -> None:
+        self._refused: dict[str, int] = {}
+        self._rig = rig
+        self._topics = {t.name: t for t in topics}
+        self._settings = ZenohSettings(connect=connect)
+        self._inbox = Inbox()
+        self._gaps: dict[tuple[str, str], GapCounter] = {}  # by topic and key
+        self._stack = ExitStack()
+        self._session: Any = None
+
+    def __enter__(self) -> Self:
+        """Raises velod.runtime.session.SessionError where the endpoint is malformed."""
+        with ExitStack() as stack:
+            self._session = stack.enter_context(open_session(self._settings))
+            for topic in self._topics.values():
+                self._inbox.add_source(topic.name, topic.qos.depth)
+                stack.enter_context(self._subscribe(topic))
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._session = None
+        self._stack.close()
+
+    def _subscribe(self, topic: Topic) -> Any:
+        def arrived(sample: Any) -> None:
+            self._inbox.put(topic.name, str(sample.key_expr), sample.payload.to_bytes())
+
+        return self._session.declare_subscriber(key(topic, self._rig), arrived)
+
+    def receive(self, timeout_s: float = math.inf) -> Received | None:
+        """The next message that can be read; None after ``timeout_s`` without one."""
+        deadline_s = time.monotonic() + timeout_s
+        while self._session is not None:
+            # In steps, so that a signal is seen and an infinite timeout is possible.
+            item = self._inbox.get(min(_POLL_S, max(0.0, deadline_s - time.monotonic())))
+            if item is not None:
+                received = self._decode(item.source, item.key, item.data, item.t_ns)
+                if received is not None:
+                    return received
+            elif time.monotonic() >= deadline_s:
+                return None
+        return None
+
+    def alive(self) -> list[tuple[str, str]]:
+        """(stage, worker) of every process that is there now, sorted. Empty: no velod was reached."""
+        if self._session is None:
+            return []
+        replies = self._session.liveliness().get(key(ALIVE, self._rig), timeout=1.0)
+        found = [parts(ALIVE, str(reply.ok.key_expr)) for reply in replies if reply.ok is not None]
+        return sorted((p["stage"], p["worker"]) for p in found)
+
+    def _decode(self, source: str, found: str, data: bytes, t_ns: int) -> Received | None:
+        topic = self._topics[source]
+        try:
+            envelope = decode(data, topic.message)
+        except WireError as e:
+            self._refused[e.reason] = self._refused.get(e.reason, 0) + 1
+            return None
+        gaps = self._gaps.setdefault((topic.name, found), GapCounter(_OVERTAKING.get(topic.name, 0)))
+        gaps.see(envelope.message.seq)
+        return Received(topic, found, envelope, t_ns, len(data))
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """What was lost, by cause.
+
+        ``gap.<topic>``: messages missing in a publisher's ``seq``; ``restart.<topic>``: publishers that began anew;
+        ``inbox.overflow.<topic>``: taken too slowly; ``wire.*``: refused by the decoder.
+        """
+        counts = {**self._inbox.counters, **self._refused}
+        for (topic, _), gaps in self._gaps.items():
+            for name, n in ((f"gap.{topic}", gaps.lost), (f"restart.{topic}", gaps.restarts)):
+                if n:
+                    counts[name] = counts.get(name, 0) + n
+        return counts
+
+
+class VelocityClient:
+    """The stream of velocities of one rig.
+
+    A context manager and an endless iterable of valid velocities (``valid_only=False``: of all). Reconnects by
+    itself. Velocities older than ``max_age_s`` at arrival are discarded and counted as ``stale``, invalid ones as
+    ``invalid``; across hosts the age needs synchronised clocks, ``math.inf`` keeps everything.
+    """
+
+    def __init__(
+        self, rig: str = "rig0", connect: str = LOCAL, max_age_s: float = 0.2, *, valid_only: bool = True
+    ) -> None:
+        self._listener = Listener(rig, (VELOCITY,), connect)
+        self._max_age_s = max_age_s
+        self._valid_only = valid_only
+        self._discarded: dict[str, int] = {}
+
+    def __enter__(self) -> Self:
+        """Raises velod.runtime.session.SessionError where the endpoint is malformed."""
+        self._listener.__enter__()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._listener.__exit__(kind, error, trace)
+
+    def __iter__(self) -> Iterator[Velocity]:
+        while (velocity := self.receive()) is not None:
+            yield velocity
+
+    def receive(self, timeout_s: float = math.inf) -> Velocity | None:
+        """The next velocity; None after ``timeout_s`` without one, and outside the ``with`` block."""
+        deadline_s = time.monotonic() + timeout_s
+        while (received := self._listener.receive(max(0.0, deadline_s - time.monotonic()))) is not None:
+            velocity = received.envelope.message
+            # The age when it is handed out, not when it came in: it may have waited in the queue.
+            age_s = (time.time_ns() - received.envelope.t_pub_ns) * 1e-9
+            if age_s > self._max_age_s:
+                self._discard("stale")
+            elif self._valid_only and isinstance(velocity, Velocity) and not velocity.valid:
+                self._discard("invalid")
+            elif isinstance(velocity, Velocity):
+                return velocity
+        return None
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """What was not handed out, by cause: stale, invalid, gap.velocity, restart.velocity, wire.*, ..."""
+        return {**self._listener.counters, **self._discarded}
+
+    def _discard(self, why: str) -> None:
+        self._discarded[why] = self._discarded.get(why, 0) + 1
