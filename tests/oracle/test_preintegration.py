@@ -1,5 +1,7 @@
 """Preintegration (Eq. 9) against gtsam, and its Jacobians against central differences."""
 
+import itertools
+
 import gtsam
 import numpy as np
 import pytest
@@ -28,7 +30,7 @@ def by_gtsam(t_ns, accel, gyro, t_i, t_j, b_a, b_w, substeps):
     params.setIntegrationCovariance(np.zeros((3, 3)))
     pim = gtsam.PreintegratedImuMeasurements(params, gtsam.imuBias.ConstantBias(b_a, b_w))
     edges = np.linspace(t_i, t_j, substeps + 1)
-    for t0, t1 in zip(edges[:-1], edges[1:], strict=True):
+    for t0, t1 in itertools.pairwise(edges):
         at = 0.5 * (t0 + t1)
         a = np.array([np.interp(at, t_ns, accel[:, i]) for i in range(3)])
         w = np.array([np.interp(at, t_ns, gyro[:, i]) for i in range(3)])

@@ -62,7 +62,7 @@ class OptimizerStage:
         self._estimator = Estimator(self._settings, self._calibration)
         self._estimator.counters = self.counters
         self._forget_batches()
-        self._imu_t_ns = 0
+        self._imu_t_ns = -1  # newest sample
         self._event_t_ns = 0
         self._tick = -1  # number of the next velocity on the grid of the output rate
         self._was_valid = False
@@ -132,7 +132,7 @@ class OptimizerStage:
         if not new.any():
             return
         t = m.sample_t_ns[new]
-        if self._imu_t_ns and t[0] - self._imu_t_ns > IMU_GAP_NS:
+        if self._imu_t_ns >= 0 and t[0] - self._imu_t_ns > IMU_GAP_NS:
             self._count("imu.gap_restart")
             self._restart_after_gap()
         self._estimator.memory.append(t, m.accel[new], m.gyro[new])
@@ -158,8 +158,11 @@ class OptimizerStage:
     def _advance(self) -> list[Velocity]:
         """Everything that can be done now, in sensor-time order."""
         out: list[Velocity] = []
-        while self._tick >= 0 and self._imu_t_ns >= (tau := self._tick_ns(self._tick)):
+        while self._tick >= 0:
+            tau = self._tick_ns(self._tick)
             complete = self._take_in_order(tau)
+            if self._imu_t_ns < tau:
+                break
             if not complete:
                 if self._max_wait_ns is None or self._imu_t_ns < tau + self._max_wait_ns:
                     break
@@ -178,6 +181,8 @@ class OptimizerStage:
             elif p is not None and p.flow is not None and p.depth is not None:
                 if p.flow.t_ns > tau:
                     return True
+                if p.flow.t_ns > self._imu_t_ns:
+                    return False
                 self._take_in(self._next_seq, p.flow, p.depth)
                 self._next_after(self._next_seq)
             elif self._next_seq <= self._closed_seq:

@@ -1,0 +1,190 @@
+"""The optimizer as a stage: what comes out, in which order, and what it says of itself."""
+
+import numpy as np
+import pytest
+
+from tests.synthetic import CALIBRATION, FLIGHT, SPIN, errors, messages
+from velod.config import from_tree
+from velod.optimizer.stage import OptimizerStage
+from velod.types import DepthBatch, FlowBatch, ImuSamples, Velocity
+
+
+def run(stream, **optimizer):
+    stage = OptimizerStage(from_tree({"optimizer": optimizer}), CALIBRATION)
+    return [v for message in stream for v in stage.handle(message)], stage
+
+
+def same(a, b):
+    return len(a) == len(b) and all(
+        (x.t_ns, x.valid, x.state, x.batch_seq) == (y.t_ns, y.valid, y.state, y.batch_seq)
+        and np.array_equal(x.v_B, y.v_B)
+        and np.array_equal(x.cov, y.cov)
+        for x, y in zip(a, b, strict=True)
+    )
+
+
+@pytest.mark.parametrize("spline", ["error", "velocity"])
+def test_a_flight_is_recovered_without_any_initial_value(spline):
+    velocities, _ = run(messages(FLIGHT, 1.5), spline=spline)
+    first = next(v for v in velocities if v.valid)
+    assert first.t_ns < 0.3e9
+    e = errors(velocities, FLIGHT)
+    assert len(e) > 80
+    assert e.mean() < 0.06
+    assert e.max() < 0.3
+
+
+def test_a_fast_spin_is_recovered_by_the_spline_on_the_error():
+    velocities, _ = run(messages(SPIN, 1.0))
+    assert errors(velocities, SPIN).mean() < 0.08
+
+
+def test_the_covariance_covers_the_error():
+    nees = []
+    for seed in range(3):
+        velocities, _ = run(messages(FLIGHT, 1.0, seed=seed))
+        for v in velocities:
+            if v.valid:
+                d = v.v_B - FLIGHT.v_B(v.t_ns * 1e-9)
+                nees.append(d @ np.linalg.solve(v.cov, d))
+    # 3 degrees of freedom; the information is shared_error times too small for noise that is not shared
+    assert 0.3 < np.mean(nees) < 6.0
+
+
+def test_gravity_is_found():
+    _, stage = run(messages(FLIGHT, 1.5))
+    head = stage._estimator.head
+    g_B = FLIGHT.R_WB(head.t_ns * 1e-9).T @ [0.0, 0.0, 9.81]
+    assert np.degrees(np.arccos(g_B @ (head.R_LB.T @ head.g_L) / 9.81**2)) < 2.0
+
+
+def test_velocities_come_on_the_grid_of_the_output_rate():
+    velocities, _ = run(messages(FLIGHT, 0.6), output_hz=75.0)
+    t = np.array([v.t_ns for v in velocities])
+    assert np.array_equal(t, (np.arange(len(t)) * 10**9) // 75)
+    assert [v.seq for v in velocities] == list(range(len(t)))
+
+
+def test_the_result_does_not_depend_on_the_order_of_arrival():
+    stream = messages(FLIGHT, 0.8)
+    reference, _ = run(stream, max_wait_ms=float("inf"))
+    rng = np.random.default_rng(3)
+    # every message up to 10 places late; IMU messages keep their own order, as one publisher's do
+    keys = np.arange(len(stream)) + rng.integers(0, 10, len(stream))
+    imu = [i for i, m in enumerate(stream) if isinstance(m, ImuSamples)]
+    keys[imu] = np.sort(keys[imu])
+    shuffled = [stream[i] for i in np.argsort(keys, kind="stable")]
+    assert [type(m) for m in shuffled] != [type(m) for m in stream]
+    again, _ = run(shuffled, max_wait_ms=float("inf"))
+    assert same(reference, again)
+
+
+def test_a_missing_batch_delays_the_velocity_by_max_wait_and_no_longer():
+    stream = messages(FLIGHT, 0.8)
+    lost = [m for m in stream if not (isinstance(m, FlowBatch) and m.seq == 30)]
+    velocities, stage = run(lost, max_wait_ms=60.0)
+    whole, _ = run(stream)
+    assert len(velocities) >= len(whole) - 5
+    assert stage.counters["velocity.without_batch"] >= 1
+    assert errors(velocities, FLIGHT).mean() < 0.06
+
+
+def test_without_end_of_waiting_nothing_comes_before_the_missing_batch():
+    stream = messages(FLIGHT, 0.8)
+    lost = [m for m in stream if not (isinstance(m, FlowBatch) and m.seq == 30)]
+    velocities, _ = run(lost, max_wait_ms=float("inf"))
+    assert max(v.t_ns for v in velocities) < 31 * 15e6
+
+
+def test_a_late_batch_is_taken_in_within_the_window():
+    stream = messages(FLIGHT, 1.0)
+    late = [m for m in stream if isinstance(m, FlowBatch) and 20 <= m.seq < 30]
+    rest = [m for m in stream if not (isinstance(m, FlowBatch) and 20 <= m.seq < 30)]
+    at = next(i for i, m in enumerate(rest) if isinstance(m, FlowBatch) and m.seq == 40)
+    velocities, stage = run(rest[:at] + late + rest[at:], max_wait_ms=30.0)
+    assert stage.counters["batch.late"] == 10
+    assert "batch.lost" not in stage.counters
+    assert errors(velocities, FLIGHT).mean() < 0.06
+
+
+def test_a_duplicated_batch_is_counted_and_changes_nothing():
+    stream = messages(FLIGHT, 0.6)
+    twice = [copy for m in stream for copy in ([m] if isinstance(m, ImuSamples) else [m, m])]
+    reference, _ = run(stream)
+    again, stage = run(twice)
+    assert same(reference, again)
+    assert stage.counters["batch.duplicate"] > 30
+
+
+def test_the_imu_carries_the_estimate_through_darkness_and_says_so():
+    velocities, _ = run(messages(FLIGHT, 1.2, dark=(0.6, 0.9)))
+    dark = [v for v in velocities if 0.72e9 < v.t_ns <= 0.9e9]
+    assert dark and all(v.valid and v.state == "degraded" and "no flow" in v.reason for v in dark)
+    assert np.trace(dark[-1].cov) > np.trace(dark[0].cov)
+    assert errors(dark, FLIGHT).max() < 0.25
+    assert velocities[-1].state == "tracking"
+
+
+def test_before_any_flow_the_estimate_is_not_valid():
+    velocities, _ = run(messages(FLIGHT, 0.5, dark=(0.0, 0.5)))
+    assert velocities
+    assert not any(v.valid for v in velocities)
+    assert {v.state for v in velocities} == {"initialising"}
+
+
+def test_a_restarted_ingest_is_followed():
+    first, second = messages(FLIGHT, 0.6), messages(FLIGHT, 1.2)
+    seq0 = 50  # its batches 50.. become 0.. of the new ingest
+    renumbered = []
+    for m in second:
+        if m.seq < seq0:
+            continue
+        fields = {k: getattr(m, k) for k in m.__slots__} | {"seq": m.seq - seq0}
+        if isinstance(m, ImuSamples):
+            fields["batch_seq"] = m.batch_seq - seq0
+        renumbered.append(type(m)(**fields))
+    velocities, stage = run(first + renumbered)
+    assert stage.counters["ingest.restart"] == 1
+    assert velocities[-1].t_ns > 1.1e9
+    assert velocities[-1].state == "tracking"
+    assert errors(velocities, FLIGHT).mean() < 0.08
+
+
+def test_a_hole_in_the_imu_of_seconds_starts_the_estimate_anew():
+    stream = messages(FLIGHT, 3.0)
+    holed = [m for m in stream if not 0.6e9 < m.t_ns < 2.2e9]
+    velocities, stage = run(holed)
+    assert stage.counters["imu.gap_restart"] == 1
+    after = [v for v in velocities if v.t_ns > 2.2e9]
+    assert not after[0].valid
+    assert after[-1].valid
+    assert errors(after, FLIGHT).mean() < 0.08
+
+
+def test_imu_samples_that_go_back_in_time_are_counted_and_dropped():
+    stream = messages(FLIGHT, 0.5)
+    doubled = [copy for m in stream for copy in ([m, m] if isinstance(m, ImuSamples) else [m])]
+    reference, _ = run(stream)
+    again, stage = run(doubled)
+    assert same(reference, again)
+    assert stage.counters["imu.backwards"] > 90
+
+
+def test_a_batch_with_few_flows_is_counted():
+    few = messages(FLIGHT, 0.3, flows=8)
+    velocities, stage = run(few)
+    assert stage.counters["batch.few_flows"] == 20
+    assert not any(v.valid for v in velocities)
+
+
+def test_a_message_of_another_kind_is_refused():
+    stage = OptimizerStage(from_tree({}), CALIBRATION)
+    with pytest.raises(TypeError, match="Velocity"):
+        stage.handle(Velocity(0, 0, np.zeros(3), np.eye(3), False, "lost", "", -1, 0))
+
+
+def test_flow_without_depth_waits_for_it():
+    stream = messages(FLIGHT, 0.4)
+    no_depth = [m for m in stream if not (isinstance(m, DepthBatch) and m.seq >= 10)]
+    velocities, _ = run(no_depth, max_wait_ms=float("inf"))
+    assert velocities[-1].t_ns < 11 * 15e6
