@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
 from velod.config import Settings
@@ -15,7 +15,10 @@ STAGES = ("ingest", "flow", "depth", "optimizer")
 class Stage(Protocol):
     """A stage does no input or output of its own: messages in, messages out."""
 
-    counters: dict[str, int]
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """What happened since the start, by name."""
+        ...
 
     def handle(self, message: Any, /) -> Sequence[Message]:
         """What follows from one message, in the order in which it is to be published."""

@@ -1,0 +1,68 @@
+"""The network's side of dispatch: ingest's batches to the workers that are alive, one key per worker."""
+
+from __future__ import annotations
+
+import math
+import time
+
+from velod.runtime.dispatch import Assignment, Dispatcher
+from velod.runtime.outlet import Outlet
+from velod.types import Done, EventBatch, StereoBatch
+from velod.wire import encode
+from velod.wire.topics import ALIVE, BATCH_DEPTH, BATCH_FLOW, Topic, parts
+
+WINDOW = 2
+"""Batches a worker is sent before it has finished the first: one in work, one on its way."""
+QUEUE = 64
+"""Batches that wait while no worker is free; at 50 a second more than a second's worth."""
+TIMEOUT_S = 2.0
+"""A worker that has not finished a batch by then has lost it, or hangs."""
+
+_TOPIC: dict[str, Topic] = {"flow": BATCH_FLOW, "depth": BATCH_DEPTH}
+
+
+class BatchDispatch:
+    """Dispatchers for flow and depth, fed by liveliness tokens and Done messages."""
+
+    def __init__(self, outlet: Outlet, lossless: bool) -> None:
+        self._outlet = outlet
+        self._dispatchers: dict[str, Dispatcher[bytes]] = {
+            stage: Dispatcher(WINDOW, None if lossless else QUEUE, math.inf if lossless else TIMEOUT_S)
+            for stage in _TOPIC
+        }
+
+    def send(self, batch: EventBatch | StereoBatch, t_origin_ns: int) -> None:
+        """Give a batch to a worker now, or as soon as one is free."""
+        stage = "flow" if isinstance(batch, EventBatch) else "depth"
+        data = encode(batch, time.time_ns(), t_origin_ns)
+        self._put(stage, self._dispatchers[stage].submit(batch.seq, data, time.monotonic()))
+
+    def done(self, done: Done) -> None:
+        """A worker reports that it has finished a batch."""
+        if done.stage in self._dispatchers:
+            self._put(done.stage, self._dispatchers[done.stage].done(done.worker, done.seq, time.monotonic()))
+
+    def alive(self, token_key: str, is_there: bool) -> None:
+        """A liveliness token came or went. Raises ValueError for a key that is none."""
+        token = parts(ALIVE, token_key)
+        dispatcher = self._dispatchers.get(token["stage"])
+        if dispatcher is not None:
+            change = dispatcher.join if is_there else dispatcher.leave
+            self._put(token["stage"], change(token["worker"], time.monotonic()))
+
+    def expire(self) -> None:
+        """Take back what has been outstanding for too long; call a few times a second."""
+        for stage, dispatcher in self._dispatchers.items():
+            self._put(stage, dispatcher.expire(time.monotonic()))
+
+    def counters(self) -> dict[str, int]:
+        """Counters of both dispatchers, ``dispatch.overflow.flow`` and so on."""
+        return {f"{name}.{stage}": n for stage, d in self._dispatchers.items() for name, n in d.counters.items()}
+
+    def alarms(self) -> dict[str, str]:
+        """Stages without a worker."""
+        return {f"workers.{stage}": f"no {stage} worker" for stage, d in self._dispatchers.items() if not d.workers}
+
+    def _put(self, stage: str, assignments: list[Assignment[bytes]]) -> None:
+        for a in assignments:
+            self._outlet.publish_bytes(_TOPIC[stage], a.batch, worker=a.worker)

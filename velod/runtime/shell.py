@@ -1,0 +1,177 @@
+"""The worker shell: subscribes, decodes, calls a stage, publishes what comes out, and reports its health.
+
+One thread, the main one, handles messages; the network's threads only fill the inbox. Whatever is wrong with a
+message is counted by name and logged once per kind; it never ends the worker.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+from threading import Event
+from typing import Any, ClassVar
+
+import zenoh
+
+from velod.config import Settings
+from velod.runtime.health import HealthReporter
+from velod.runtime.inbox import Inbox, Item
+from velod.runtime.measure import GapCounter
+from velod.runtime.outlet import Outlet
+from velod.runtime.stages import Stage, alarms_of
+from velod.types import Message
+from velod.wire import Envelope, WireError, decode
+from velod.wire.topics import ALIVE, HEALTH, Topic, key
+
+log = logging.getLogger("velod")
+
+POLL_S = 0.1
+"""How long the main thread sleeps at the most before it looks at signals and at the clock."""
+FIFO_DEPTH = 4096
+"""Ingest and the optimizer must lose nothing inside: seconds of any driver's packets."""
+CONSUMER_WAIT_S = 5.0
+
+
+class WorkerShell:
+    """One stage as a process: ``run`` until ``stop`` is set. The three kinds of stages differ in ``roles``."""
+
+    inputs: ClassVar[dict[Topic, int]] = {}
+    """What the stage takes, and how far messages on one key may overtake each other; -1: do not look for gaps."""
+    depth: ClassVar[int] = FIFO_DEPTH
+
+    def __init__(
+        self, session: zenoh.Session, settings: Settings, stage_name: str, worker: str, stage: Stage
+    ) -> None:
+        self.session, self.rig = session, settings.rig.name
+        self.stage_name, self.worker, self.stage = stage_name, worker, stage
+        self.inbox = Inbox()
+        self.outlet = Outlet(session, self.rig, settings.zenoh.lossless)
+        self.health = HealthReporter(stage_name, worker)
+        self._topics = {t.name: t for t in self.inputs}
+        self._counters: dict[str, int] = {}
+        self._gaps: dict[str, tuple[str, GapCounter]] = {}  # by key: topic and counter
+        self._heard_s: dict[Topic, float] = {}  # when the last message came
+        self._logged: set[str] = set()
+        self._t_ns = 0
+
+    def run(self, stop: Event) -> None:
+        """Handle messages until ``stop`` is set; then leave nothing declared."""
+        with ExitStack() as stack:
+            stack.enter_context(self.outlet)
+            self.subscribe(stack)
+            self._wait_for_consumers(stop)
+            token = key(ALIVE, self.rig, stage=self.stage_name, worker=self.worker)
+            stack.enter_context(self.session.liveliness().declare_token(token))
+            log.info("up")
+            while not stop.is_set():
+                item = self.inbox.get(min(POLL_S, self.health.due_in_s()))
+                if item is not None:
+                    self._take(item)
+                if self.health.due_in_s() == 0.0:
+                    self.every_second()
+
+    # What a role adds -----------------------------------------------------------------------------------------
+
+    def subscribe(self, stack: ExitStack) -> None:
+        """Declare the subscribers of the stage's inputs."""
+        for topic in self.inputs:
+            self.listen(stack, topic, key(topic, self.rig))
+
+    def consumers(self) -> list[tuple[Topic, dict[str, str]]]:
+        """Whom the process needs to be listening before it is of any use."""
+        return []
+
+    def received(self, source: str, envelope: Envelope) -> None:
+        """A message that is not for the stage."""
+        raise NotImplementedError(source)
+
+    def publish(self, outputs: Sequence[Message], cause: Envelope) -> None:
+        """Publish what the stage made of ``cause``."""
+        raise NotImplementedError
+
+    def counters(self) -> dict[str, int]:
+        """All counters of the process."""
+        gaps: dict[str, int] = {}
+        for topic, counter in self._gaps.values():
+            for name, n in ((f"gap.{topic}", counter.lost), (f"restart.{topic}", counter.restarts)):
+                if n:
+                    gaps[name] = gaps.get(name, 0) + n
+        return {**self.stage.counters, **self.inbox.counters, **self.outlet.counters, **self._counters, **gaps}
+
+    def alarms(self) -> dict[str, str]:
+        """What is wrong now: the stage's own alarms, and inputs that have fallen silent."""
+        now_s = time.monotonic()
+        silent = {
+            f"stale.{topic.name}": f"nothing on {key(topic, self.rig)} for {now_s - heard_s:.1f} s"
+            for topic, heard_s in self._heard_s.items()
+            if topic.stale_after_s and now_s - heard_s > topic.stale_after_s
+        }
+        return {**alarms_of(self.stage), **silent}
+
+    def every_second(self) -> None:
+        """Publish the health of the period that ends."""
+        health = self.health.report(self._t_ns, self.counters(), self.alarms())
+        self.outlet.publish(HEALTH, health, worker=self.worker)
+
+    # What all roles use ---------------------------------------------------------------------------------------
+
+    def listen(self, stack: ExitStack, topic: Topic, at: str) -> None:
+        """Subscribe to one topic; its messages go through the inbox."""
+        self.inbox.add_source(topic.name, self.depth)
+
+        def arrived(sample: zenoh.Sample) -> None:
+            self.inbox.put(topic.name, str(sample.key_expr), sample.payload.to_bytes())
+
+        # "indirect" would hand each sample to one more thread; the inbox is hand-over enough.
+        callback = zenoh.handlers.Callback(arrived, indirect=False)
+        stack.enter_context(self.session.declare_subscriber(at, callback))
+
+    def count(self, name: str, text: str = "", *, with_trace: bool = False) -> None:
+        """Count by name; with a text, log it the first time that this happens."""
+        self._counters[name] = self._counters.get(name, 0) + 1
+        if text and name not in self._logged:
+            self._logged.add(name)
+            log.warning("%s (further ones are only counted)", text, exc_info=with_trace)
+
+    def take_other(self, item: Item) -> bool:
+        """Handle an item that is no message; True if it was one."""
+        return False
+
+    def _wait_for_consumers(self, stop: Event) -> None:
+        """Be alive only once what is published can arrive: a new link takes a moment to carry subscriptions."""
+        for topic, parts in self.consumers():
+            if not stop.is_set() and not self.outlet.wait_for_subscriber(topic, CONSUMER_WAIT_S, **parts):
+                log.warning("nobody listens on %s yet", key(topic, self.rig, **parts))
+
+    def _take(self, item: Item) -> None:
+        """One item of the inbox, whatever it is; nothing that is wrong with it gets further than here."""
+        try:
+            if self.take_other(item):
+                return
+            topic = self._topics.get(item.source)
+            envelope = decode(item.data, None if topic is None else topic.message)
+        except WireError as e:
+            self.count(e.reason, f"{item.key}: {e}")
+            return
+        if topic is None:
+            self.received(item.source, envelope)
+            return
+        self._note_arrival(topic, item.key, envelope.message)
+        try:
+            outputs = self.stage.handle(envelope.message)
+        except Exception as e:  # a worker outlives whatever one message does to its stage
+            name = f"error.{type(e).__name__}"
+            self.count(name, f"{name} on {item.key}, seq {envelope.message.seq}", with_trace=True)
+            outputs = []
+        self.publish(outputs, envelope)
+
+    def _note_arrival(self, topic: Topic, at: str, message: Any) -> None:
+        self.count(f"in.{topic.name}")
+        self._heard_s[topic] = time.monotonic()
+        self._t_ns = max(self._t_ns, message.t_ns)
+        if (overtaking := self.inputs[topic]) >= 0:
+            if at not in self._gaps:
+                self._gaps[at] = (topic.name, GapCounter(overtaking))
+            self._gaps[at][1].see(message.seq)

@@ -1,0 +1,137 @@
+"""A worker process: command line, signals, settings from the service, stage, shell."""
+
+from __future__ import annotations
+
+import argparse
+import ctypes
+import gc
+import logging
+import os
+import signal
+import sys
+from collections.abc import Sequence
+from threading import Event
+
+import zenoh
+
+from velod.config import Settings, ZenohSettings
+from velod.geometry.calibration import Calibration
+from velod.runtime import warmup
+from velod.runtime.roles import SHELLS
+from velod.runtime.session import introducer_endpoint, open_session
+from velod.runtime.settings_service import fetch
+from velod.runtime.stages import Stage, create_stage, stage_of
+
+EXIT_USAGE = 2
+_PR_SET_PDEATHSIG = 1
+_SWITCH_INTERVAL_S = 0.0005
+
+log = logging.getLogger("velod")
+
+
+def main(stage: str, argv: Sequence[str] | None = None) -> int:
+    """Run one worker of ``stage`` until SIGTERM or SIGINT; returns the exit code."""
+    args = _parser(f"python -P -m velod.workers.{stage}", worker=f"{stage}-0").parse_args(argv)
+    start_logging(args.worker)
+    try:
+        if stage_of(args.worker) != stage:
+            raise ValueError(f"--worker {args.worker}: must be {stage}-<number>")
+        prepare_process(args.parent)
+        stop = stop_on_signals()
+        with open_session(zenoh_settings(args)) as session:
+            settings, calibration = fetch(session, args.rig, args.connect)
+            built = create_stage(stage, settings, calibration)
+            warmup.warm_up(stage, settings, calibration)
+            serve_stage(session, settings, args.worker, built, stop)
+    except (OSError, ValueError) as e:
+        log.error("%s", e)
+        return EXIT_USAGE
+    return 0
+
+
+def serve_stage(session: zenoh.Session, settings: Settings, worker: str, stage: Stage, stop: Event) -> None:
+    """Handle messages as ``worker`` until ``stop`` is set."""
+    # What was made until now lives as long as the process: the collector need not look at it again.
+    gc.collect()
+    gc.freeze()
+    name = stage_of(worker)
+    SHELLS[name](session, settings, name, worker, stage).run(stop)
+
+
+def load_stages(settings: Settings, calibration: Calibration, names: Sequence[str]) -> dict[str, Stage]:
+    """Stages ready for their first message: kernels loaded, tables made."""
+    for name in names:
+        warmup.warm_up(name, settings, calibration)
+    return {name: create_stage(name, settings, calibration) for name in names}
+
+
+def worker_arguments(settings: ZenohSettings, rig: str, worker: str) -> list[str]:
+    """The command line of a worker that belongs to a service with these settings."""
+    arguments = ["--connect", introducer_endpoint(settings), "--rig", rig, "--worker", worker]
+    arguments += ["--parent", str(os.getpid())]
+    if settings.listen:
+        arguments += ["--listen", settings.listen]
+    if settings.config:
+        arguments += ["--zenoh-config", settings.config]
+    return arguments if settings.shared_memory else [*arguments, "--no-shared-memory"]
+
+
+def zenoh_settings(args: argparse.Namespace) -> ZenohSettings:
+    """The settings of a worker's session, from its command line."""
+    return ZenohSettings(
+        connect=args.connect,
+        listen=args.listen,
+        config=args.zenoh_config,
+        shared_memory=not args.no_shared_memory,
+    )
+
+
+def parse_arguments(program: str, argv: Sequence[str] | None) -> argparse.Namespace:
+    """The command line that ``worker_arguments`` writes."""
+    return _parser(program, worker="").parse_args(argv)
+
+
+def _parser(program: str, worker: str) -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        program, description="One worker of a velod service; `velod run` starts it, or you do, on any host."
+    )
+    default = introducer_endpoint(ZenohSettings())
+    parser.add_argument(
+        "--connect", default=default, help=f"endpoint of the service's introducer (default {default})"
+    )
+    parser.add_argument("--rig", default="rig0", help="name of the rig (default rig0)")
+    parser.add_argument("--worker", default=worker, help="this worker's name, <stage>-<number>, one of its kind")
+    parser.add_argument("--listen", default="", help="endpoint on which other hosts reach this process; any port")
+    parser.add_argument("--zenoh-config", default="", help="a zenoh configuration file (JSON5) instead")
+    parser.add_argument("--no-shared-memory", action="store_true", help="TCP only, within this host as well")
+    parser.add_argument("--parent", type=int, default=0, help="process id of the supervisor, to die with it")
+    return parser
+
+
+def start_logging(worker: str) -> None:
+    """Log lines on stderr, with the time and the worker's name."""
+    logging.basicConfig(
+        level=logging.INFO,
+        stream=sys.stderr,
+        format=f"%(asctime)s.%(msecs)03d {worker} %(levelname)s %(message)s",
+        datefmt="%H:%M:%S",
+        force=True,
+    )
+
+
+def prepare_process(parent: int) -> None:
+    """Die with the parent (Linux), hand the interpreter lock over quickly, find a place for compiled kernels."""
+    if parent and sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        if os.getppid() != parent:
+            raise OSError(f"the supervisor (process {parent}) is gone")
+    sys.setswitchinterval(_SWITCH_INTERVAL_S)
+    warmup.ensure_cache_directory()
+
+
+def stop_on_signals() -> Event:
+    """An event that SIGTERM and SIGINT set."""
+    stop = Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: stop.set())
+    return stop

@@ -1,0 +1,8 @@
+"""The ingest worker: ``python -P -m velod.workers.ingest --connect tcp/127.0.0.1:17447 --worker ingest-0``."""
+
+import sys
+
+from velod.runtime.worker import main
+
+if __name__ == "__main__":
+    sys.exit(main("ingest"))
