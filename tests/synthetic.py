@@ -44,6 +44,7 @@ SPIN = Motion(
 )
 
 
+@cache
 def messages(
     motion, seconds, seed=0, flows=250, period_s=0.015, imu_hz=200, noise=1.0, outliers=0.03, dark=(9.0, 9.0)
 ):

@@ -101,7 +101,7 @@ def test_a_late_batch_is_taken_in_within_the_window():
     late = [m for m in stream if isinstance(m, FlowBatch) and 20 <= m.seq < 30]
     rest = [m for m in stream if not (isinstance(m, FlowBatch) and 20 <= m.seq < 30)]
     at = next(i for i, m in enumerate(rest) if isinstance(m, FlowBatch) and m.seq == 40)
-    velocities, stage = run(rest[:at] + late + rest[at:], max_wait_ms=30.0)
+    velocities, stage = run([*rest[:at], *late, *rest[at:]], max_wait_ms=30.0)
     assert stage.counters["batch.late"] == 10
     assert "batch.lost" not in stage.counters
     assert errors(velocities, FLIGHT).mean() < 0.06
@@ -143,7 +143,7 @@ def test_a_restarted_ingest_is_followed():
         if isinstance(m, ImuSamples):
             fields["batch_seq"] = m.batch_seq - seq0
         renumbered.append(type(m)(**fields))
-    velocities, stage = run(first + renumbered)
+    velocities, stage = run([*first, *renumbered])
     assert stage.counters["ingest.restart"] == 1
     assert velocities[-1].t_ns > 1.1e9
     assert velocities[-1].state == "tracking"
