@@ -53,9 +53,9 @@ class DepthStage:
         matches = match(left, right_mirrored, x, y, self._settings.block_px, self._settings.max_disparity_px)
         refined = self._refine(message, matches.disparity)
         is_refined = refined.outcome == REFINED
-        by_block = self._accept_by_block(left, right_mirrored, x, y, matches, ~is_refined)
         disparity = np.where(is_refined, refined.disparity, matches.disparity)
-        return [self._publish(message, disparity, self._sigma_px(refined), is_refined, by_block)]
+        accepted = self._accept(left, right_mirrored, x, y, matches, disparity, is_refined)
+        return [self._publish(message, disparity, self._sigma_px(refined), is_refined, accepted)]
 
     def _fits(self, message: StereoBatch) -> bool:
         """The surfaces and the events are on the sensors of the calibration."""
@@ -98,29 +98,38 @@ class DepthStage:
                 self.counters[f"unrefined.{name}"] += int(count[number])
         return refined
 
-    def _accept_by_block(
-        self, left: Surface, right_mirrored: Surface, x: I64, y: I64, matches: Matches, candidates: Bools
+    def _accept(
+        self,
+        left: Surface,
+        right_mirrored: Surface,
+        x: I64,
+        y: I64,
+        matches: Matches,
+        disparity: F64,
+        is_refined: Bools,
     ) -> Bools:
-        """(n,) which of the candidates stand on block matching alone."""
+        """(n,) which disparities stand: refined or of a strong match, and checked against ambiguity."""
         s = self._settings
-        matched = candidates & np.isfinite(matches.disparity)
-        strong = matched & (matches.score >= s.min_zncc)
-        accepted = strong & matches.enclosed
+        matched = np.isfinite(disparity)
+        strong = is_refined | (matched & matches.enclosed & (matches.score >= s.min_zncc))
+        accepted = strong
         if s.check == "left-right":
-            accepted = self._left_right_agree(left, right_mirrored, x, y, matches, accepted)
+            # Refined ones as well: on real events one in thirty sits on the wrong edge of a repetitive texture, and
+            # of those that agree one in a hundred.
+            accepted = self._left_right_agree(left, right_mirrored, x, y, disparity, strong)
         elif s.check == "uniqueness":
-            accepted = accepted & (matches.second <= s.uniqueness * matches.score)
-        self.counters["points.no_match"] += int(np.count_nonzero(candidates & ~matched))
+            accepted = is_refined | (strong & (matches.second <= s.uniqueness * matches.score))
+        self.counters["points.no_match"] += int(np.count_nonzero(~matched))
         self.counters["points.low_zncc"] += int(np.count_nonzero(matched & ~strong))
         self.counters["points.ambiguous"] += int(np.count_nonzero(strong & ~accepted))
         return accepted
 
     def _left_right_agree(
-        self, left: Surface, right_mirrored: Surface, x: I64, y: I64, matches: Matches, candidates: Bools
+        self, left: Surface, right_mirrored: Surface, x: I64, y: I64, disparity: F64, candidates: Bools
     ) -> Bools:
         """Those candidates whose match in the right image has its own best match back here."""
         at = np.flatnonzero(candidates)
-        x_right = x[at] - np.rint(matches.disparity[at]).astype(np.int64)
+        x_right = x[at] - np.rint(disparity[at]).astype(np.int64)
         # Mirrored, the right image takes the left one's part.
         back = match(
             right_mirrored,
@@ -130,9 +139,8 @@ class DepthStage:
             self._settings.block_px,
             self._settings.max_disparity_px,
         )
-        agree = np.abs(back.disparity - matches.disparity[at]) <= self._settings.left_right_px
         out = np.zeros_like(candidates)
-        out[at[agree]] = True
+        out[at] = np.abs(back.disparity - disparity[at]) <= self._settings.left_right_px
         return out
 
     def _sigma_px(self, refined: Refined) -> F64:
@@ -145,14 +153,13 @@ class DepthStage:
         )
 
     def _publish(
-        self, message: StereoBatch, disparity: F64, sigma_px: F64, is_refined: Bools, by_block: Bools
+        self, message: StereoBatch, disparity: F64, sigma_px: F64, is_refined: Bools, accepted: Bools
     ) -> DepthBatch:
-        found = is_refined | by_block
-        near = found & (disparity >= self._settings.min_disparity_px)
+        near = accepted & (disparity >= self._settings.min_disparity_px)
         self.counters["points"] += message.x.shape[0]
-        self.counters["points.too_far"] += int(np.count_nonzero(found & ~near))
+        self.counters["points.too_far"] += int(np.count_nonzero(accepted & ~near))
         self.counters["points.refined"] += int(np.count_nonzero(near & is_refined))
-        self.counters["points.block"] += int(np.count_nonzero(near & by_block))
+        self.counters["points.block"] += int(np.count_nonzero(near & ~is_refined))
         index = np.flatnonzero(near)
         # Z = f b / d
         per_px = 1.0 / (self._rectification.f * self._rectification.baseline_m)
