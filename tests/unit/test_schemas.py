@@ -59,3 +59,15 @@ def test_columns_are_little_endian_and_their_shapes_refer_to_known_sizes(name: s
 def test_every_schema_file_belongs_to_a_message_or_is_the_envelope() -> None:
     files = {p.name for p in (ROOT / "schemas").glob("*.json")}
     assert files == {f"{name}.v1.json" for name in [*MESSAGE_TYPES, "Envelope"]}
+
+
+@pytest.mark.parametrize("name", [*NAMES, "Envelope"])
+def test_the_document_for_other_languages_says_what_the_schema_says(name: str) -> None:
+    text = (ROOT / "docs" / "messages.md").read_text("utf-8")
+    heading = "Every message carries" if name == "Envelope" else f"### {name}\n"
+    section = text.split(heading, 1)[1].split("\n#", 1)[0]
+    rows = [line for line in section.splitlines() if line.startswith("| `")]
+    tree = json.loads((ROOT / "schemas" / f"{name}.v1.json").read_text("utf-8"))
+    assert [row.split("`")[1] for row in rows] == [f["name"] for f in tree["fields"]]
+    for row, f in zip(rows, tree["fields"], strict=True):
+        assert f["doc"] in row and f.get("dtype", "") in row and f.get("frame", "") in row, f["name"]
