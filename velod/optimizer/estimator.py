@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -87,13 +87,13 @@ class Estimator:
         if self.window.empty:
             if rows is None:
                 return
-            self._start(int(rows.t_ns.min()))
+            self._start(int(rows[0].t_ns.min()))
         late = self.head is not None and flow.t_ns <= self.head.t_ns
         predicted = None if late or self.head is None else self.predict(flow.t_ns)
         if not late:
             self._extend_to(flow.t_ns)
         if rows is not None:
-            self._add_flow(flow.t_ns, rows, predicted)
+            self._add_flow(flow.t_ns, *rows, predicted)
         self._solve_head(self.head.t_ns if late and self.head is not None else flow.t_ns)
 
     def predict(self, t_ns: int) -> tuple[F64, F64] | None:
@@ -134,8 +134,8 @@ class Estimator:
             return R[0], np.zeros(3), np.eye(3)
         return R[0], R[0].T @ s[0], R[0].T
 
-    def _rows(self, flow: FlowBatch, depth: DepthBatch) -> Rows | None:
-        """Rows of the flow equation on the spline and b_w, where flow and depth speak of the same event."""
+    def _rows(self, flow: FlowBatch, depth: DepthBatch) -> tuple[Rows, Rows] | None:
+        """Rows of the flow equation where flow and depth speak of the same event: on the spline, and on e."""
         _, at_flow, at_depth = np.intersect1d(flow.index, depth.index, assume_unique=True, return_indices=True)
         t = flow.t_ns - flow.age[at_flow].astype(np.int64)
         inside = (t >= self.memory.t_ns[0]) & (self.window.empty | (t >= self.window.first * self._knot_ns))
@@ -154,11 +154,15 @@ class Estimator:
             sigma = np.full(len(t), self._o.fixed_sigma_px_s)
         else:
             sigma = flow_equation.sigmas(flow.sigma[at_flow], inv_depth, depth.sigma[at_depth], z)
-        a = a_B
-        if self._o.spline == "error":
-            a = np.einsum("ijk,ik->ij", R_LB, a_B)
-            z = z - np.einsum("ij,ij->i", a, s_L)
-        return Rows(t, z, a, b_B, sigma)
+        a_L = np.einsum("ijk,ik->ij", R_LB, a_B)
+        on_error = Rows(t, z - np.einsum("ij,ij->i", a_L, s_L), a_L, b_B, sigma)
+        return on_error if self._o.spline == "error" else Rows(t, z, a_B, b_B, sigma), on_error
+
+    def _fit(self, t_ns: int, on_error: Rows) -> Fit | None:
+        """The batch's own solution for e at ``t_ns``: gravity, which e holds, is taken from what is known of it."""
+        dt = (on_error.t_ns - t_ns) * 1e-9
+        still = replace(on_error, z=on_error.z + (on_error.a @ self._gravity()) * dt)
+        return flow_equation.solve(still, self._o.ransac_iterations, self._o.seed + t_ns // 1000)
 
     def _start(self, t_ns: int) -> None:
         self.window.start(t_ns)
@@ -208,8 +212,8 @@ class Estimator:
         cov = G @ p.cov @ G.T + np.eye(3) * IMU_MODEL_SIGMA**2
         return J, r, np.asarray(np.linalg.inv(cov))
 
-    def _add_flow(self, t_ns: int, rows: Rows, predicted: tuple[F64, F64] | None) -> None:
-        fit = flow_equation.solve(rows, self._o.ransac_iterations, self._o.seed + t_ns // 1000)
+    def _add_flow(self, t_ns: int, rows: Rows, on_error: Rows, predicted: tuple[F64, F64] | None) -> None:
+        fit = self._fit(t_ns, on_error)
         if fit is None:
             self._count("batch.undetermined")
             return
@@ -225,10 +229,9 @@ class Estimator:
 
     def _innovation(self, t_ns: int, fit: Fit, predicted: tuple[F64, F64]) -> float:
         """Squared Mahalanobis distance of the batch's own velocity from the predicted one."""
-        _, N, M = self._frame(t_ns)
-        d = N + M @ fit.e - predicted[0]
-        # the fit is of the batch's middle: what gravity does until its end is in the tolerance
-        S = M @ fit.cov @ M.T * self._o.shared_error + predicted[1] + np.eye(3) * 0.05**2
+        R, s_L, _ = self.memory.at(np.array([t_ns]))
+        d = R[0].T @ (s_L[0] + fit.e) - predicted[0]
+        S = R[0].T @ fit.cov @ R[0] * self._o.shared_error + predicted[1]
         return float(d @ np.linalg.solve(S, d))
 
     def _solve_head(self, t_ns: int) -> None:
