@@ -71,6 +71,7 @@ class WorkerShell:
                     self._take(item)
                 if self.health.due_in_s() == 0.0:
                     self.every_second()
+            self.every_second()  # the last word: counters up to the end
 
     # What a role adds -----------------------------------------------------------------------------------------
 

@@ -31,7 +31,7 @@ log = logging.getLogger("velod")
 
 def main(stage: str, argv: Sequence[str] | None = None) -> int:
     """Run one worker of ``stage`` until SIGTERM or SIGINT; returns the exit code."""
-    args = _parser(f"python -P -m velod.workers.{stage}", worker=f"{stage}-0").parse_args(argv)
+    args = worker_parser(f"python -P -m velod.workers.{stage}", worker=f"{stage}-0").parse_args(argv)
     start_logging(args.worker)
     try:
         if stage_of(args.worker) != stage:
@@ -73,6 +73,8 @@ def worker_arguments(settings: ZenohSettings, rig: str, worker: str) -> list[str
         arguments += ["--listen", settings.listen]
     if settings.config:
         arguments += ["--zenoh-config", settings.config]
+    if settings.lossless:
+        arguments.append("--lossless")
     return arguments if settings.shared_memory else [*arguments, "--no-shared-memory"]
 
 
@@ -83,15 +85,16 @@ def zenoh_settings(args: argparse.Namespace) -> ZenohSettings:
         listen=args.listen,
         config=args.zenoh_config,
         shared_memory=not args.no_shared_memory,
+        lossless=args.lossless,
     )
 
 
 def parse_arguments(program: str, argv: Sequence[str] | None) -> argparse.Namespace:
     """The command line that ``worker_arguments`` writes."""
-    return _parser(program, worker="").parse_args(argv)
+    return worker_parser(program, worker="").parse_args(argv)
 
 
-def _parser(program: str, worker: str) -> argparse.ArgumentParser:
+def worker_parser(program: str, worker: str) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         program, description="One worker of a velod service; `velod run` starts it, or you do, on any host."
     )
@@ -104,6 +107,7 @@ def _parser(program: str, worker: str) -> argparse.ArgumentParser:
     parser.add_argument("--listen", default="", help="endpoint on which other hosts reach this process; any port")
     parser.add_argument("--zenoh-config", default="", help="a zenoh configuration file (JSON5) instead")
     parser.add_argument("--no-shared-memory", action="store_true", help="TCP only, within this host as well")
+    parser.add_argument("--lossless", action="store_true", help="replay: keep a link that blocks for longer")
     parser.add_argument("--parent", type=int, default=0, help="process id of the supervisor, to die with it")
     return parser
 
