@@ -114,9 +114,10 @@ def _common_grid(calib: Calibration, R_rect_left: F64, R_rect_right: F64) -> Cam
         low.append(np.array([p[0, 0], p[2, 1]]) - p[4])
         high.append(np.array([p[1, 0], p[3, 1]]) - p[4])
     size = np.array([calib.left.width, calib.left.height], dtype=np.float64)
-    # A lens that folds before the edge's middle says NaN: then the sensor's own size.
-    below = np.nan_to_num(-np.min(low, axis=0), nan=np.inf)
-    above = np.nan_to_num(np.max(high, axis=0), nan=np.inf)
+    # A lens that folds before the edge's middle says NaN there: then as much as is allowed.
+    most = 0.5 * _MAX_GROWTH * size
+    below = np.nan_to_num(-np.min(low, axis=0), nan=most)
+    above = np.nan_to_num(np.max(high, axis=0), nan=most)
     span = np.clip(np.ceil(below + above), size - 1.0, np.floor(_MAX_GROWTH * size) - 1.0)
     middle = np.mean(centres, axis=0) + 0.5 * np.clip(above - below, -size / 4, size / 4)
     cx, cy = 0.5 * span - middle
