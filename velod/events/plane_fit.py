@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 from numba import njit
 
 from velod.types import F64, PATCH
@@ -36,56 +37,49 @@ def fit_plane(age: F64, reject_px: float, rejections: int, min_neighbours: int) 
     """
     kept = 0
     for i in range(SIZE):
-        if age[i] > 0.0:
-            kept |= 1 << i
+        kept |= np.int64(age[i] > 0.0) << i
+    t_ref = -age[SIZE // 2]
     for round_ in range(rejections + 1):
-        # Centred moments: first the means, then the second moments about them.
-        n = 0
-        mx = 0.0
-        my = 0.0
-        mt = 0.0
-        for i in range(SIZE):
-            if kept >> i & 1:
-                n += 1
-                mx += i % PATCH - HALF
-                my += i // PATCH - HALF
-                mt -= age[i]
+        # One branchless pass; t is taken from the centre's, so that no digits are lost when centring the moments.
+        i = n = x = y = xx = xy = yy = 0
+        t = xt = yt = 0.0
+        for dy in range(-HALF, HALF + 1):
+            for dx in range(-HALF, HALF + 1):
+                k = kept >> i & 1
+                n += k
+                x += k * dx
+                y += k * dy
+                xx += k * dx * dx
+                xy += k * dx * dy
+                yy += k * dy * dy
+                kt = k * (-age[i] - t_ref)
+                t += kt
+                xt += dx * kt
+                yt += dy * kt
+                i += 1
         if n < min_neighbours or n < 3:
             break
-        mx /= n
-        my /= n
-        mt /= n
-        sxx = 0.0
-        sxy = 0.0
-        syy = 0.0
-        sxt = 0.0
-        syt = 0.0
-        for i in range(SIZE):
-            if kept >> i & 1:
-                dx = i % PATCH - HALF - mx
-                dy = i // PATCH - HALF - my
-                dt = -age[i] - mt
-                sxx += dx * dx
-                sxy += dx * dy
-                syy += dy * dy
-                sxt += dx * dt
-                syt += dy * dt
+        mx, my, mt = x / n, y / n, t / n
+        sxx, sxy, syy = xx - x * mx, xy - x * my, yy - y * my
+        sxt, syt = xt - x * mt, yt - y * mt
         det = sxx * syy - sxy * sxy
         if det <= MIN_DETERMINANT * sxx * syy:
             break
         gx = (syy * sxt - sxy * syt) / det
         gy = (sxx * syt - sxy * sxt) / det
+        t0 = mt - gx * mx - gy * my + t_ref
         limit = reject_px * math.sqrt(gx * gx + gy * gy)
         rss = 0.0
-        outliers = 0
-        for i in range(SIZE):
-            if kept >> i & 1:
-                r = -age[i] - mt - gx * (i % PATCH - HALF - mx) - gy * (i // PATCH - HALF - my)
-                rss += r * r
-                if abs(r) > limit:
-                    outliers |= 1 << i
+        i = outliers = 0
+        for dy in range(-HALF, HALF + 1):
+            for dx in range(-HALF, HALF + 1):
+                k = kept >> i & 1
+                r = -age[i] - t0 - gx * dx - gy * dy
+                rss += k * r * r
+                outliers |= np.int64(abs(r) > limit) << i
+                i += 1
+        outliers &= kept
         if outliers == 0 or round_ == rejections:
-            t0 = mt - gx * mx - gy * my
             return n, gx, gy, t0, math.sqrt(rss / n), syy / det, -sxy / det, sxx / det
         kept &= ~outliers
     return 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0

@@ -1,0 +1,81 @@
+"""Surfaces of active events (SAE): the newest event times per pixel and polarity (T of Eq. 5).
+
+Two surfaces are kept of each camera. An edge fires several events per pixel, so ``first`` holds the first event
+of the newest burst (what the plane fit needs), and ``last`` the last event of any kind (what the time surfaces of
+block matching need). Stamps are int64 ns of sensor time, ``NEVER`` where nothing has happened.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from velod.events.plane_fit import HALF, SIZE
+from velod.types import I64, PATCH, U8, U16, U32
+
+NEVER = -(2**62)
+"""Stamp of a pixel without events: older than any memory, and far from int64 overflow in differences."""
+
+MAX_U16 = 65_535
+
+
+def new_surface(height: int, width: int) -> I64:
+    """An empty surface (2, height, width): index 0 = OFF, 1 = ON."""
+    return np.full((2, height, width), NEVER, np.int64)
+
+
+@njit(cache=True, nogil=True)
+def update_sae(x: U16, y: U16, t_ns: I64, p: U8, first: I64, last: I64, refractory_ns: int) -> None:
+    """Enter events, in time order, into ``first`` and ``last`` (2, h, w), in place.
+
+    An event sooner than ``refractory_ns`` after the last one of its pixel and polarity belongs to that one's burst
+    and updates only ``last``. Coordinates and polarities must have been checked.
+    """
+    for i in range(t_ns.size):
+        k, r, c, t = p[i], y[i], x[i], t_ns[i]
+        if t - last[k, r, c] >= refractory_ns:
+            first[k, r, c] = t
+        last[k, r, c] = t
+
+
+def age_unit_ns(memory_ns: int) -> int:
+    """The finest whole number of ns in which every age up to ``memory_ns`` fits into 16 bits."""
+    return math.ceil(memory_ns / MAX_U16)
+
+
+@njit(cache=True, nogil=True)
+def _encode_ages(stamp: I64, t_end_ns: int, memory_ns: int, unit_ns: int, out: U16) -> None:
+    unit = np.float64(unit_ns)
+    for i in range(stamp.size):
+        # In float64 because its division vectorises; the floor is exact for these integers.
+        age = np.int32(min(max(t_end_ns - stamp[i], 0), memory_ns + 1))
+        steps = np.int32((np.float64(age) + (unit - 1.0)) / unit)
+        out[i] = np.uint16(steps) if age <= memory_ns else np.uint16(0)
+
+
+def encode_ages(stamp: I64, t_end_ns: int, memory_ns: int) -> U16:
+    """Ages before ``t_end_ns`` in steps of ``age_unit_ns(memory_ns)``, rounded up; 0 beyond the memory.
+
+    ``stamp``: C-contiguous int64 of any shape, ns; the result has the same shape. Stamps at or after ``t_end_ns``
+    give 0.
+    """
+    out = np.empty(stamp.shape, np.uint16)
+    _encode_ages(stamp.reshape(-1), t_end_ns, memory_ns, age_unit_ns(memory_ns), out.reshape(-1))
+    return out
+
+
+@njit(cache=True, nogil=True)
+def gather_patches(surface: I64, x: U16, y: U16, p: U8, t_end_ns: int, memory_ns: int, age: U32, patch: U32) -> None:
+    """Ages (ns before ``t_end_ns``) of the events and of their 5x5 same-polarity neighbours on ``surface``.
+
+    Writes ``age`` (n,) and ``patch`` (n, 25) row-major, 0 where the stamp is older than ``memory_ns``. Events must
+    be at least 2 px inside.
+    """
+    for i in range(x.size):
+        k, r0, c0 = p[i], np.int64(y[i]) - HALF, np.int64(x[i]) - HALF
+        for j in range(SIZE):
+            a = t_end_ns - surface[k, r0 + j // PATCH, c0 + j % PATCH]
+            patch[i, j] = np.uint32(a) if 0 < a <= memory_ns else np.uint32(0)
+        age[i] = patch[i, SIZE // 2]

@@ -1,0 +1,319 @@
+"""Which events of a batch are worth a flow and a depth: at most a quota, spread evenly over the image.
+
+Selection is a pure function of the surfaces at the batch's end, the batch's times and its ``seq``. Candidates are
+taken from the cells of a coarse grid in turn, in an order drawn from ``seq``, and the expensive test is made only for
+those whose turn comes.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from velod.events.plane_fit import HALF, SIZE, fit_plane
+from velod.events.sae import NEVER, age_unit_ns
+from velod.types import F64, I64, PATCH, U8, U16
+
+DRAWS = 16
+"""Candidates tried in a cell before it is the next one's turn."""
+
+GOOD = 0.5
+"""Fits with an rms below this share of the gate are taken before the others."""
+
+ENOUGH = 2.0
+"""The search ends when this many times the quota are acceptable."""
+
+MAX_ASYMMETRY = 0.6
+"""Neighbourhoods less symmetric than this about the event are not worth a fit (0: a plane, 1: half an edge)."""
+
+I32 = NDArray[np.int32]
+
+PAPER_MIN_NEIGHBOURS = 16
+"""Sec. V-A, rule 2: more than 15 neighbours in the 5x5 window."""
+
+
+def select_burst(
+    first: I64,
+    taken: I64,
+    encoded: U16,
+    t_start_ns: int,
+    t_end_ns: int,
+    *,
+    memory_ns: int,
+    reject_px: float,
+    rejections: int,
+    min_neighbours: int,
+    max_rms_px: float,
+    border_px: int,
+    quota: int,
+    seq: int,
+) -> tuple[U16, U16, U8]:
+    """First events of bursts whose edge has just passed the whole of their 5x5 neighbourhood.
+
+    An event itself comes when its edge has crossed half of the neighbourhood; the plane can be fitted without bias
+    only once the other half has fired too. So an event is selected in the batch that completes it: the newest
+    stamp of its same-polarity neighbourhood on ``first`` (2, h, w), int64 ns, lies in [t_start_ns, t_end_ns), and a
+    plane leaves ``min_neighbours`` of 25 after rejection (see ``fit_plane``) with an rms below ``max_rms_px``. It is
+    at most half the memory old. ``encoded`` is ``encode_ages(first, t_end_ns, memory_ns)``; ``taken`` (2, h, w) holds
+    the stamps selected before: those are skipped, and the new ones are entered.
+
+    Returns columns x, y, p in the order of the surface (p, y, x).
+    """
+    mask = np.zeros(first.shape, np.uint8)
+    _mark_passed(encoded, memory_ns // 2 // age_unit_ns(memory_ns), mask)
+    chosen = _choose(
+        first, mask, t_start_ns, t_end_ns, memory_ns, border_px, quota, seq,
+        True, reject_px, rejections, min_neighbours, max_rms_px, taken,
+    )  # fmt: skip
+    taken.reshape(-1)[chosen] = first.reshape(-1)[chosen]
+    return _columns(chosen, first)
+
+
+def select_paper(
+    last: I64,
+    t_start_ns: int,
+    t_end_ns: int,
+    *,
+    memory_ns: int,
+    time_share: float,
+    border_px: int,
+    quota: int,
+    seq: int,
+) -> tuple[U16, U16, U8]:
+    """The culling rules of Sec. V-A on the unfiltered surface ``last`` (2, h, w), int64 ns.
+
+    Kept are events in [t_start_ns, t_end_ns) that are (1) ``border_px`` inside, (2) have more than 15 neighbours
+    and (3) differ from the neighbours' mean time by at most ``time_share * memory_ns``.
+    """
+    mask = ((last >= t_start_ns) & (last < t_end_ns)).view(np.uint8)
+    none_taken = np.full(last.shape, NEVER, np.int64)
+    chosen = _choose(
+        last, mask, t_start_ns, t_end_ns, memory_ns, border_px, quota, seq,
+        False, time_share * memory_ns, 0, PAPER_MIN_NEIGHBOURS, 0.0, none_taken,
+    )  # fmt: skip
+    return _columns(chosen, last)
+
+
+def _columns(chosen: I32, surface: I64) -> tuple[U16, U16, U8]:
+    _, h, w = surface.shape
+    p, rest = np.divmod(np.sort(chosen), h * w)
+    y, x = np.divmod(rest, w)
+    return x.astype(np.uint16), y.astype(np.uint16), p.astype(np.uint8)
+
+
+def _choose(
+    surface: I64,
+    mask: U8,
+    t_start_ns: int,
+    t_end_ns: int,
+    memory_ns: int,
+    border_px: int,
+    quota: int,
+    seq: int,
+    burst: bool,
+    tolerance: float,
+    rejections: int,
+    min_neighbours: int,
+    max_rms_px: float,
+    taken: I64,
+) -> I32:
+    """Flat indices into ``surface`` of at most ``quota`` events out of those marked."""
+    _, h, w = surface.shape
+    # About as many cells as events wanted.
+    cell_px = max(1, round(math.sqrt(h * w / quota)))
+    columns = -(-w // cell_px)
+    index = np.empty(surface.size, np.int32)
+    cell_end = np.zeros(columns * -(-h // cell_px) + 1, np.int32)
+    _candidates(surface, taken, mask, max(border_px, HALF), cell_px, columns, index, cell_end)
+    chosen = np.empty(quota, np.int32)
+    n = _take_in_turn(
+        surface, t_start_ns, t_end_ns, memory_ns, burst, tolerance, rejections, min_neighbours,
+        max_rms_px, seq, index, cell_end, chosen,
+    )  # fmt: skip
+    return chosen[:n]
+
+
+@njit(cache=True, nogil=True)
+def _mark_passed(age: U16, reach: int, mask: U8) -> None:
+    """Mark pixels whose outer neighbours lie symmetrically about them in time, as on a plane.
+
+    A filter that vectorises, and spares most of the fits. ``age``, ``reach``: encoded steps; 0 counts as oldest.
+    """
+    _, h, w = age.shape
+    if w < PATCH:
+        return
+    n = w - PATCH + 1
+    for k in range(2):
+        for r in range(HALF, h - HALF):
+            up, row, down = age[k, r - HALF], age[k, r], age[k, r + HALF]
+            marks = mask[k, r, HALF : w - HALF]
+            w0, e0 = row[:n], row[PATCH - 1 :]
+            nw, n0, ne = up[:n], up[HALF : w - HALF], up[PATCH - 1 :]
+            sw, s0, se = down[:n], down[HALF : w - HALF], down[PATCH - 1 :]
+            c0 = row[HALF : w - HALF]
+            for i in range(n):
+                t = _oldest_if_none(c0[i])
+                a, b = _oldest_if_none(w0[i]) - t, _oldest_if_none(e0[i]) - t
+                c, d = _oldest_if_none(n0[i]) - t, _oldest_if_none(s0[i]) - t
+                e, f = _oldest_if_none(nw[i]) - t, _oldest_if_none(se[i]) - t
+                g, j = _oldest_if_none(ne[i]) - t, _oldest_if_none(sw[i]) - t
+                symmetric = abs(a + b) + abs(c + d) + abs(e + f) + abs(g + j)
+                antisymmetric = abs(a - b) + abs(c - d) + abs(e - f) + abs(g - j)
+                plane = np.float32(symmetric) <= np.float32(MAX_ASYMMETRY) * np.float32(antisymmetric)
+                marks[i] = np.uint8(plane & (t < reach))
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _oldest_if_none(age: np.uint16) -> np.int32:
+    return np.int32(np.uint16(age - np.uint16(1)))
+
+
+@njit(cache=True, nogil=True)
+def _candidates(
+    surface: I64, taken: I64, mask: U8, border_px: int, cell_px: int, columns: int, index: I32, cell_end: I32
+) -> None:
+    """Flat indices of marked and untaken stamps, sorted by cell: cell c is index[cell_end[c] : cell_end[c + 1]]."""
+    _, h, w = surface.shape
+    found = np.empty(surface.size, np.int32)
+    cell = np.empty(surface.size, np.int32)
+    n = 0
+    for k in range(2):
+        for r in range(border_px, h - border_px):
+            for c in range(border_px, w - border_px):
+                if mask[k, r, c] and surface[k, r, c] != taken[k, r, c]:
+                    found[n] = (k * h + r) * w + c
+                    cell[n] = r // cell_px * columns + c // cell_px
+                    cell_end[cell[n] + 1] += 1
+                    n += 1
+    for i in range(1, cell_end.size):
+        cell_end[i] += cell_end[i - 1]
+    fill = cell_end[:-1].copy()
+    for i in range(n):
+        index[fill[cell[i]]] = found[i]
+        fill[cell[i]] += 1
+
+
+@njit(cache=True, nogil=True)
+def _take_in_turn(
+    surface: I64,
+    t_start_ns: int,
+    t_end_ns: int,
+    memory_ns: int,
+    burst: bool,
+    tolerance: float,
+    rejections: int,
+    min_neighbours: int,
+    max_rms_px: float,
+    seq: int,
+    index: I32,
+    cell_end: I32,
+    chosen: I32,
+) -> int:
+    """A candidate from each cell in turn, good ones before acceptable ones, until the quota or all are exhausted."""
+    _, h, w = surface.shape
+    cells = np.flatnonzero(cell_end[1:] > cell_end[:-1])
+    open_cells = cells.size
+    state = _mix(np.uint64(seq))
+    top = cell_end[1:].copy()
+    age = np.empty(SIZE, np.float64)
+    reserve = np.empty_like(chosen)
+    n = 0
+    n_reserve = 0
+    while open_cells > 0 and n < chosen.size and n + n_reserve < ENOUGH * chosen.size:
+        # The cells of one round in random order: a last, incomplete round must not favour the top of the image.
+        for i in range(open_cells - 1, 0, -1):
+            state = _mix(state)
+            j = _below(state, i + 1)
+            cells[i], cells[j] = cells[j], cells[i]
+        still_open = 0
+        for i in range(open_cells):
+            cell = cells[i]
+            for _ in range(min(DRAWS, top[cell] - cell_end[cell])):
+                # Draw without replacement: the drawn one is overwritten by the last of those left.
+                state = _mix(state)
+                j = cell_end[cell] + _below(state, top[cell] - cell_end[cell])
+                flat = index[j]
+                top[cell] -= 1
+                index[j] = index[top[cell]]
+                k, r, c = flat // (h * w), flat // w % h, flat % w
+                newest = _ages(surface[k], r, c, t_end_ns, memory_ns, age)
+                if burst:
+                    if newest > t_end_ns - t_start_ns:
+                        continue
+                    rms = _burst_rms_px(age, tolerance, rejections, min_neighbours)
+                    if not rms < max_rms_px:
+                        continue
+                    if rms >= GOOD * max_rms_px:
+                        if n_reserve < reserve.size:
+                            reserve[n_reserve] = flat
+                            n_reserve += 1
+                        continue
+                elif not _obeys_paper(age, min_neighbours, tolerance * 1e-9):
+                    continue
+                if n < chosen.size:
+                    chosen[n] = flat
+                    n += 1
+                break
+            if top[cell] > cell_end[cell]:
+                cells[still_open] = cell
+                still_open += 1
+        open_cells = still_open
+    for i in range(min(n_reserve, chosen.size - n)):
+        chosen[n] = reserve[i]
+        n += 1
+    return n
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _mix(state: np.uint64) -> np.uint64:
+    """A step of splitmix64 (Steele, Lea, Flood 2014)."""
+    z = state + np.uint64(0x9E3779B97F4A7C15)
+    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return z ^ (z >> np.uint64(31))
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _below(state: np.uint64, n: int) -> int:
+    """A number in [0, n) from the state's upper half."""
+    return np.int64((state >> np.uint64(32)) * np.uint64(n) >> np.uint64(32))
+
+
+@njit(cache=True, nogil=True)
+def _ages(surface: I64, r: int, c: int, t_end_ns: int, memory_ns: int, age: F64) -> int:
+    """Ages in s of the 5x5 neighbourhood, 0 where older than the memory; returns the least, ns."""
+    newest = memory_ns
+    for j in range(SIZE):
+        a = t_end_ns - surface[r - HALF + j // PATCH, c - HALF + j % PATCH]
+        inside = 0 < a <= memory_ns
+        age[j] = a * 1e-9 if inside else 0.0
+        if inside and a < newest:
+            newest = a
+    return newest
+
+
+@njit(cache=True, nogil=True)
+def _burst_rms_px(age: F64, reject_px: float, rejections: int, min_neighbours: int) -> float:
+    """How well one plane explains the neighbourhood on both sides of the event, px; inf where none does."""
+    n = 0
+    for j in range(SIZE):
+        n += age[j] > 0.0
+    if n < min_neighbours:
+        return math.inf
+    left, gx, gy, _, rms, _, _, _ = fit_plane(age, reject_px, rejections, min_neighbours)
+    slope = math.hypot(gx, gy)
+    return rms / slope if left > 0 and slope > 0.0 else math.inf
+
+
+@njit(cache=True, nogil=True)
+def _obeys_paper(age: F64, min_neighbours: int, spread_s: float) -> bool:
+    n = 0
+    total = 0.0
+    for j in range(SIZE):
+        if age[j] > 0.0 and j != SIZE // 2:
+            n += 1
+            total += age[j]
+    return n >= min_neighbours and abs(age[SIZE // 2] - total / n) <= spread_s

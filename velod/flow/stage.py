@@ -1,0 +1,59 @@
+"""Flow worker: selected events with their neighbourhoods in, normal flow with its sigma out (Eq. 5-6)."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+
+from velod.config import Settings
+from velod.events.plane_fit import SIZE
+from velod.flow.kernel import REFUSALS, fit_flows
+from velod.geometry.calibration import Calibration
+from velod.geometry.rectify import rectify
+from velod.types import EventBatch, FlowBatch
+
+
+class FlowStage:
+    """Stateless but for ``counters``: the flows of a batch depend on nothing but the batch.
+
+    ``counters``: "batches", "flows", "batches.malformed", and one per cause of refusal, "flow.<cause>".
+    """
+
+    def __init__(self, settings: Settings, calibration: Calibration) -> None:
+        self.counters: Counter[str] = Counter()
+        self._settings = settings.flow
+        rectification = rectify(calibration)
+        self._xy = np.ascontiguousarray(rectification.left_xy, np.float32)
+        self._covector = np.ascontiguousarray(rectification.left_covector, np.float32)
+
+    def handle(self, message: EventBatch) -> list[FlowBatch]:
+        """One FlowBatch per EventBatch, possibly empty; none where the batch cannot be read."""
+        if not self._well_formed(message):
+            self.counters["batches.malformed"] += 1
+            return []
+        s, m = self._settings, message
+        size = len(m.x)
+        index = np.empty(size, np.uint16)
+        flow = np.empty((size, 6), np.float32)
+        refused = np.zeros(len(REFUSALS), np.int64)
+        n = fit_flows(
+            m.x, m.y, m.patch, self._xy, self._covector,
+            s.reject_px, s.rejections, s.min_neighbours, s.max_rms_px, s.max_speed_px_s, s.method == "benosman",
+            index, flow, refused,
+        )  # fmt: skip
+        self.counters["batches"] += 1
+        self.counters["flows"] += n
+        for cause, count in zip(REFUSALS, refused.tolist(), strict=True):
+            self.counters[f"flow.{cause}"] += count
+        index, flow = index[:n].copy(), flow[:n]
+        x, y, nx_ny, speed, sigma = flow[:, 0], flow[:, 1], flow[:, 2:4], flow[:, 4], flow[:, 5]
+        columns = (np.ascontiguousarray(c) for c in (x, y, nx_ny, speed, sigma))
+        return [FlowBatch(m.seq, m.t_ns, size, index, m.age[index], *columns)]
+
+    def _well_formed(self, m: EventBatch) -> bool:
+        h, w = self._xy.shape[:2]
+        size = len(m.x)
+        if not len(m.y) == len(m.age) == len(m.p) == size or m.patch.shape != (size, SIZE) or size > 65_535:
+            return False
+        return size == 0 or (int(m.x.max()) < w and int(m.y.max()) < h)
