@@ -20,7 +20,7 @@ UNKNOWN_SIGMA = 100.0
 """Of a velocity nothing is known about, m/s."""
 MIN_BATCHES = 3
 """Batches with a velocity before the first valid one."""
-VALID_SIGMA, VALID_SHARE = 0.25, 0.02
+VALID_SIGMA, VALID_SHARE = 0.1, 0.01
 """A velocity becomes valid when its largest sigma is below VALID_SIGMA m/s + VALID_SHARE of its speed ..."""
 LOST_FACTOR = 4.0
 """... and stays valid until it is this many times larger."""
