@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 from numba import njit
 
 from velod.types import F64, PATCH
@@ -37,7 +36,7 @@ def fit_plane(age: F64, reject_px: float, rejections: int, min_neighbours: int) 
     """
     kept = 0
     for i in range(SIZE):
-        kept |= np.int64(age[i] > 0.0) << i
+        kept |= int(age[i] > 0.0) << i
     t_ref = -age[SIZE // 2]
     for round_ in range(rejections + 1):
         # One branchless pass; t is taken from the centre's, so that no digits are lost when centring the moments.
@@ -76,7 +75,7 @@ def fit_plane(age: F64, reject_px: float, rejections: int, min_neighbours: int) 
                 k = kept >> i & 1
                 r = -age[i] - t0 - gx * dx - gy * dy
                 rss += k * r * r
-                outliers |= np.int64(abs(r) > limit) << i
+                outliers |= int(abs(r) > limit) << i
                 i += 1
         outliers &= kept
         if outliers == 0 or round_ == rejections:

@@ -279,7 +279,7 @@ def _mix(state: np.uint64) -> np.uint64:
 @njit(cache=True, nogil=True, inline="always")
 def _below(state: np.uint64, n: int) -> int:
     """A number in [0, n) from the state's upper half."""
-    return np.int64((state >> np.uint64(32)) * np.uint64(n) >> np.uint64(32))
+    return int((state >> np.uint64(32)) * np.uint64(n) >> np.uint64(32))
 
 
 @njit(cache=True, nogil=True)

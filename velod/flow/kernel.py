@@ -60,8 +60,8 @@ def fit_flows(
             refused[_RMS] += 1
             continue
         r, c = y[i], x[i]
-        a, b = np.float64(covector[r, c, 0, 0]), np.float64(covector[r, c, 0, 1])
-        d, e = np.float64(covector[r, c, 1, 0]), np.float64(covector[r, c, 1, 1])
+        a, b = float(covector[r, c, 0, 0]), float(covector[r, c, 0, 1])
+        d, e = float(covector[r, c, 1, 0]), float(covector[r, c, 1, 1])
         # grad_T is a covector: it transforms by the inverse transpose of the undistortion's Jacobian.
         tx = a * gx + b * gy
         ty = d * gx + e * gy
@@ -96,5 +96,5 @@ def fit_flows(
         m += 1
     # An error in n lets in the motion along the edge, which a flow does not know but the batch does.
     for i in range(m):
-        flow[i, 5] *= max(np.float64(flow[i, 4]), NORMAL_TO_FULL * total / m)
+        flow[i, 5] *= max(float(flow[i, 4]), NORMAL_TO_FULL * total / m)
     return m

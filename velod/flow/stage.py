@@ -7,6 +7,7 @@ from collections import Counter
 import numpy as np
 
 from velod.config import Settings
+from velod.events.columns import readonly
 from velod.events.plane_fit import SIZE
 from velod.flow.kernel import REFUSALS, fit_flows
 from velod.geometry.calibration import Calibration
@@ -38,7 +39,8 @@ class FlowStage:
         flow = np.empty((size, 6), np.float32)
         refused = np.zeros(len(REFUSALS), np.int64)
         n = fit_flows(
-            m.x, m.y, m.patch, self._xy, self._covector,
+            readonly(m.x, np.uint16), readonly(m.y, np.uint16), readonly(m.patch, np.uint32),
+            self._xy, self._covector,
             s.reject_px, s.rejections, s.min_neighbours, s.max_rms_px, s.max_speed_px_s, s.method == "benosman",
             index, flow, refused,
         )  # fmt: skip

@@ -1,0 +1,189 @@
+"""Ingest: raw events and IMU samples in; selected events, surfaces and checked samples out.
+
+The batches depend on the streams alone: not on how a driver cuts them into packets, nor (as long as no camera lags by
+more than ``max_skew_ms``) on how the packets of the cameras and the IMU interleave.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+
+from velod.config import Settings
+from velod.events.plane_fit import SIZE
+from velod.events.sae import age_unit_ns, encode_ages, gather_patches, new_surface
+from velod.events.selection import select_burst, select_paper
+from velod.geometry.calibration import Calibration
+from velod.ingest.batch import OpenBatch
+from velod.ingest.imu import ImuStream
+from velod.ingest.ordering import ClockRestart
+from velod.ingest.stream import CameraStream
+from velod.types import F64, I64, U8, U16, EventBatch, EventPacket, ImuPacket, ImuSamples, StereoBatch
+
+Output = EventBatch | StereoBatch | ImuSamples
+
+
+class IngestStage:
+    """Owns the surfaces of both cameras.
+
+    ``counters``: "batches", "batches.without_right", "clock.restart" and drops by cause ("packets.*", "events.*",
+    "imu.*"). ``alarms``: what is wrong at the moment ("camera.left", "camera.right", "imu.frozen").
+    """
+
+    def __init__(self, settings: Settings, calibration: Calibration) -> None:
+        self.counters: Counter[str] = Counter()
+        self.alarms: dict[str, str] = {}
+        self._settings = settings
+        self._calibration = calibration
+        self._memory_ns = round(settings.ingest.memory_ms * 1e6)
+        self._skew_ns = round(settings.ingest.max_skew_ms * 1e6)
+        self._batch_seq = -1
+        self._imu_seq = -1
+        self._start_epoch()
+
+    def _start_epoch(self) -> None:
+        """Forget everything of the sensor's clock so far."""
+        s, cal = self._settings.ingest, self._calibration
+        self._left = CameraStream(s, cal.left.width, cal.left.height, self.counters)
+        self._right = CameraStream(s, cal.right.width, cal.right.height, self.counters)
+        self._imu = ImuStream(s, cal.time_offset_s, self.counters, self.alarms)
+        self._taken = new_surface(cal.left.height, cal.left.width)
+        self._open = OpenBatch(s)
+        self._batch_t_ns = 0
+        self.alarms.clear()
+
+    def handle(self, message: EventPacket | ImuPacket) -> list[Output]:
+        """Batches that the message closes (each as StereoBatch, EventBatch, ImuSamples), or its IMU samples."""
+        if isinstance(message, ImuPacket):
+            return self._on_imu(message)
+        return self._on_events(message)
+
+    def _on_events(self, packet: EventPacket) -> list[Output]:
+        if packet.camera not in ("left", "right"):
+            self.counters["packets.camera"] += 1
+            return []
+        if not len(packet.x) == len(packet.y) == len(packet.p) == len(packet.event_t_ns):
+            self.counters["packets.malformed"] += 1
+            return []
+        try:
+            ordered = self._camera(packet).order.push(packet)
+        except ClockRestart:
+            self.counters["clock.restart"] += 1
+            self._start_epoch()
+            ordered = self._camera(packet).order.push(packet)
+        for p in ordered:
+            self._camera(p).accept(p)
+        return self._close_batches() if ordered else []
+
+    def _camera(self, packet: EventPacket) -> CameraStream:
+        return self._left if packet.camera == "left" else self._right
+
+    def _on_imu(self, packet: ImuPacket) -> list[Output]:
+        n = len(packet.sample_t_ns)
+        if packet.accel.shape != (n, 3) or packet.gyro.shape != (n, 3):
+            self.counters["packets.malformed"] += 1
+            return []
+        try:
+            ordered = self._imu.order.push(packet)
+        except ClockRestart:
+            self.counters["clock.restart"] += 1
+            self._start_epoch()
+            ordered = self._imu.order.push(packet)
+        return [self._imu_samples(*self._imu.accept(p)) for p in ordered]
+
+    def _imu_samples(self, t_ns: I64, accel: F64, gyro: F64) -> ImuSamples:
+        self._imu_seq += 1
+        # The open batch ends after every left event that is known, and at its end where that is known.
+        open_end = self._open.t_end_ns
+        event_t_ns = self._left.watermark_ns if open_end is None else open_end - 1
+        event_t_ns = max(event_t_ns, self._batch_t_ns)
+        return ImuSamples(
+            self._imu_seq, self._imu.t_ns, event_t_ns, self._batch_seq, self._batch_t_ns, t_ns, accel, gyro
+        )
+
+    def _close_batches(self) -> list[Output]:
+        out: list[Output] = []
+        while True:
+            left, right, batch = self._left, self._right, self._open
+            batch.find_end(left.queue.peek()[2], left.watermark_ns)
+            horizon = batch.horizon_ns(left.watermark_ns)
+            batch.fill(left.enter_before(horizon))
+            # Events of the right camera do not pile up while the left one is silent.
+            right.enter_before(max(horizon, right.watermark_ns - self._skew_ns))
+            if batch.t_start_ns is None or batch.t_end_ns is None or not self._is_complete(batch.t_end_ns):
+                break
+            if not batch.is_idle():
+                out += self._emit(batch.t_start_ns, batch.t_end_ns, batch.n)
+            batch.begin_next()
+        self._watch_skew()
+        return out
+
+    def _is_complete(self, t_end_ns: int) -> bool:
+        """Whether all events before ``t_end_ns`` are known, or will not be waited for."""
+        if self._left.watermark_ns < t_end_ns:
+            return False
+        if self._right.watermark_ns >= t_end_ns:
+            return True
+        if self._left.watermark_ns - t_end_ns < self._skew_ns:
+            return False
+        self.counters["batches.without_right"] += 1
+        return True
+
+    def _watch_skew(self) -> None:
+        """An alarm for the camera that lags behind the other."""
+        lag_ns = self._left.watermark_ns - self._right.watermark_ns
+        for name, behind in (("right", lag_ns), ("left", -lag_ns)):
+            if behind >= self._skew_ns:
+                self.alarms[f"camera.{name}"] = f"the {name} camera lags by more than {self._skew_ns / 1e6:g} ms"
+            else:
+                self.alarms.pop(f"camera.{name}", None)
+
+    def _emit(self, t_start_ns: int, t_end_ns: int, n_events: int) -> list[Output]:
+        self._batch_seq += 1
+        self._batch_t_ns = t_end_ns
+        self.counters["batches"] += 1
+        seq, memory_ns = self._batch_seq, self._memory_ns
+        left, right, left_last, right_last = (
+            encode_ages(stamp, t_end_ns, memory_ns)
+            for stamp in (
+                self._left.first,
+                self._right.first,
+                self._left.last.max(axis=0),
+                self._right.last.max(axis=0),
+            )
+        )
+        x, y, age, p, patch = self._select(left, t_start_ns, t_end_ns)
+        unit_ns = age_unit_ns(memory_ns)
+        return [
+            StereoBatch(seq, t_end_ns, t_start_ns, unit_ns, x, y, age, p, left, right, left_last, right_last),
+            EventBatch(seq, t_end_ns, t_start_ns, n_events, x, y, age, p, patch),
+            self._no_samples(t_end_ns),
+        ]
+
+    def _select(self, encoded: U16, t_start_ns: int, t_end_ns: int) -> tuple[U16, U16, np.ndarray, U8, np.ndarray]:
+        s, fit, memory_ns = self._settings.ingest, self._settings.flow, self._memory_ns
+        if s.selection == "burst":
+            surface = self._left.first
+            x, y, p = select_burst(
+                surface, self._taken, encoded, t_start_ns, t_end_ns,
+                memory_ns=memory_ns, reject_px=fit.reject_px, rejections=fit.rejections,
+                min_neighbours=s.min_neighbours, max_rms_px=fit.max_rms_px,
+                border_px=s.border_px, quota=s.quota, seq=self._batch_seq,
+            )  # fmt: skip
+        else:
+            surface = self._left.last
+            x, y, p = select_paper(
+                surface, t_start_ns, t_end_ns,
+                memory_ns=memory_ns, time_share=s.paper_time_share,
+                border_px=s.border_px, quota=s.quota, seq=self._batch_seq,
+            )  # fmt: skip
+        age, patch = np.empty(len(x), np.uint32), np.empty((len(x), SIZE), np.uint32)
+        gather_patches(surface, x, y, p, t_end_ns, memory_ns, age, patch)
+        return x, y, age, p, patch
+
+    def _no_samples(self, t_end_ns: int) -> ImuSamples:
+        """Tells the optimizer of a closed batch without waiting for the IMU."""
+        self._imu_seq += 1
+        none, no_rows = np.empty(0, np.int64), np.empty((0, 3))
+        return ImuSamples(self._imu_seq, self._imu.t_ns, t_end_ns, self._batch_seq, t_end_ns, none, no_rows, no_rows)
