@@ -105,8 +105,8 @@ class Service:
                 self._changed.wait(0.1)
                 if time.monotonic() - max(self.heard_s, started_s) > STALL_S:
                     raise PlayerError(
-                        f"no progress for {STALL_S:.0f} s: the newest velocity is at {self.velocity_t_ns * 1e-9:.3f} s of"
-                        f" sensor time, {t_ns * 1e-9:.3f} s is waited for"
+                        f"no progress for {STALL_S:.0f} s: the newest velocity is at {self.velocity_t_ns * 1e-9:.3f}"
+                        f" s of sensor time, {t_ns * 1e-9:.3f} s is waited for"
                     )
 
     def wait_until_quiet(self, stop: Event) -> None:

@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import IO
 
-TAIL_LINES = 12
+TAIL_LINES = 3
 _LOG_READ_S = 0.2
 
 LineSink = Callable[[str], None]

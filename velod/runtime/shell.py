@@ -31,7 +31,7 @@ POLL_S = 0.1
 """How long the main thread sleeps at the most before it looks at signals and at the clock."""
 FIFO_DEPTH = 4096
 """Ingest and the optimizer must lose nothing inside: seconds of any driver's packets."""
-CONSUMER_WAIT_S = 5.0
+CONSUMER_WAIT_S = 2.0
 
 
 class WorkerShell:

@@ -23,11 +23,11 @@ from velod.runtime.stages import STAGES, Stage, stage_of
 from velod.runtime.worker import (
     EXIT_USAGE,
     load_stages,
-    parse_arguments,
     prepare_process,
     serve_stage,
     start_logging,
     stop_on_signals,
+    worker_parser,
     zenoh_settings,
 )
 
@@ -40,14 +40,16 @@ log = logging.getLogger("velod")
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Wait, then be a worker; returns the exit code."""
-    args = parse_arguments("python -P -m velod.runtime.spare", argv)
+    parser = worker_parser("python -P -m velod.runtime.spare", worker="")
+    parser.add_argument("--stages", default=",".join(STAGES), help="which stages it is to stand by for")
+    args = parser.parse_args(argv)
     start_logging("spare")
     try:
         prepare_process(args.parent)
         stop = stop_on_signals()
         with open_session(zenoh_settings(args)) as session:
             settings, calibration = fetch(session, args.rig, args.connect)
-            stages = _load_in_background(settings, calibration)
+            stages = _load_in_background(settings, calibration, args.stages.split(","))
             print(READY, flush=True)
             worker = _wait_for_order(stop)
             if worker:
@@ -59,8 +61,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _load_in_background(settings: Settings, calibration: Calibration) -> dict[str, Stage]:
-    """Load all stages in a thread of low priority, so as not to slow the workers that are busy.
+def _load_in_background(settings: Settings, calibration: Calibration, names: Sequence[str]) -> dict[str, Stage]:
+    """Load stages in a thread of low priority, so as not to slow the workers that are busy.
 
     Raises whatever loading raised.
     """
@@ -72,7 +74,7 @@ def _load_in_background(settings: Settings, calibration: Calibration) -> dict[st
         if sys.platform == "linux":
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICENESS)
         try:
-            loaded.update(load_stages(settings, calibration, STAGES))
+            loaded.update(load_stages(settings, calibration, names))
         except Exception as e:
             failure.append(e)
 

@@ -243,7 +243,8 @@ class Supervisor:
             self._spare.close()
             self._spare, self._wants_spare = None, False
         elif self._spare is None and self.is_up(self._stages):
-            self._spare = ChildProcess(self._command("velod.runtime.spare", ""), self._on_line)
+            command = [*self._command("velod.runtime.spare", ""), "--stages", ",".join(self._stages)]
+            self._spare = ChildProcess(command, self._on_line)
 
     def _counters(self) -> dict[str, int]:
         return {f"restarts.{s.worker}": s.restarts for s in self._slots.values() if s.restarts}

@@ -89,12 +89,8 @@ def zenoh_settings(args: argparse.Namespace) -> ZenohSettings:
     )
 
 
-def parse_arguments(program: str, argv: Sequence[str] | None) -> argparse.Namespace:
-    """The command line that ``worker_arguments`` writes."""
-    return worker_parser(program, worker="").parse_args(argv)
-
-
 def worker_parser(program: str, worker: str) -> argparse.ArgumentParser:
+    """The command line that ``worker_arguments`` writes; ``worker`` is the default name."""
     parser = argparse.ArgumentParser(
         program, description="One worker of a velod service; `velod run` starts it, or you do, on any host."
     )
