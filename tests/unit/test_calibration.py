@@ -1,6 +1,7 @@
 """Calibration files: what is good comes back unchanged, what is bad gives one line naming file, field and reason."""
 
 import copy
+import re
 from pathlib import Path
 from typing import Any
 
@@ -122,7 +123,7 @@ def test_a_file_that_is_no_calibration_says_why(tmp_path: Path, text: str, reaso
 
 
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(CalibrationError, match="rig.yaml: no such file"):
+    with pytest.raises(CalibrationError, match=re.escape("rig.yaml: no such file")):
         load_calibration(tmp_path / "rig.yaml")
 
 
@@ -155,7 +156,7 @@ def test_a_kalibr_camchain_of_another_camera_model_is_refused(tmp_path: Path) ->
     tree["cam1"]["camera_model"] = "omni"
     path = tmp_path / "camchain.yaml"
     path.write_text(yaml.safe_dump(tree))
-    with pytest.raises(CalibrationError, match="cam1.camera_model: must be pinhole, got 'omni'"):
+    with pytest.raises(CalibrationError, match=re.escape("cam1.camera_model: must be pinhole, got 'omni'")):
         load_calibration(path)
 
 
@@ -205,19 +206,23 @@ def test_a_ros_matrix_with_fewer_numbers_than_declared_is_refused(
     tmp_path: Path, ros_pair: dict[str, dict[str, Any]]
 ) -> None:
     ros_pair["right"]["T_right_left"]["data"] = ros_pair["right"]["T_right_left"]["data"][:9]
-    with pytest.raises(CalibrationError, match="right.yaml: T_right_left: declared 3x4, but data holds 9 numbers"):
+    with pytest.raises(
+        CalibrationError, match=re.escape("right.yaml: T_right_left: declared 3x4, but data holds 9 numbers")
+    ):
         load_calibration(write_pair(tmp_path, ros_pair))
 
 
 def test_two_baselines_in_one_ros_pair_are_refused(tmp_path: Path, ros_pair: dict[str, dict[str, Any]]) -> None:
     ros_pair["right"]["projection_matrix"]["data"][3] *= 1.1
-    with pytest.raises(CalibrationError, match="baseline 0.05971 m disagrees with the projection matrix's 0.06568 m"):
+    with pytest.raises(
+        CalibrationError, match=re.escape("baseline 0.05971 m disagrees with the projection matrix's 0.06568 m")
+    ):
         load_calibration(write_pair(tmp_path, ros_pair))
 
 
 def test_half_a_ros_pair_names_the_missing_file(tmp_path: Path, ros_pair: dict[str, dict[str, Any]]) -> None:
     write_pair(tmp_path, {"left": ros_pair["left"]})
-    with pytest.raises(CalibrationError, match="right.yaml: no such file"):
+    with pytest.raises(CalibrationError, match=re.escape("right.yaml: no such file")):
         load_calibration(tmp_path)
 
 
@@ -233,7 +238,9 @@ def test_real_ros_pairs_are_read(name: str) -> None:
 @pytest.mark.data
 @needs_data
 def test_dsecs_right_file_is_refused_for_its_nine_numbers() -> None:
-    with pytest.raises(CalibrationError, match="right.yaml: T_right_left: declared 3x4, but data holds 9 numbers"):
+    with pytest.raises(
+        CalibrationError, match=re.escape("right.yaml: T_right_left: declared 3x4, but data holds 9 numbers")
+    ):
         load_calibration(DATA / "esvo2_dsec" / "right.yaml")
 
 
@@ -243,7 +250,9 @@ def test_a_real_kalibr_camchain_takes_the_imu_from_a_second_file_and_says_so_wit
     calib = load_calibration(KALIBR, KALIBR_IMU)
     assert calib.t_RL[0] == pytest.approx(-0.05968, abs=1e-5)
     assert calib.time_offset_s == pytest.approx(1.9438e-3, abs=1e-7)
-    with pytest.raises(CalibrationError, match="cam0.T_cam_imu: missing; add it, or give the camchain-imucam file"):
+    with pytest.raises(
+        CalibrationError, match=re.escape("cam0.T_cam_imu: missing; add it, or give the camchain-imucam file")
+    ):
         load_calibration(KALIBR)
     with pytest.raises(CalibrationError, match="cam1: missing"):
         load_calibration(KALIBR_IMU)

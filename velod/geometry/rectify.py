@@ -116,8 +116,8 @@ def _common_grid(calib: Calibration, R_rect_left: F64, R_rect_right: F64) -> Cam
     size = np.array([calib.left.width, calib.left.height], dtype=np.float64)
     # A lens that folds before the edge's middle says NaN there: then as much as is allowed.
     most = 0.5 * _MAX_GROWTH * size
-    below = np.nan_to_num(-np.min(low, axis=0), nan=most)
-    above = np.nan_to_num(np.max(high, axis=0), nan=most)
+    below, above = -np.min(low, axis=0), np.max(high, axis=0)
+    below, above = np.where(np.isnan(below), most, below), np.where(np.isnan(above), most, above)
     span = np.clip(np.ceil(below + above), size - 1.0, np.floor(_MAX_GROWTH * size) - 1.0)
     middle = np.mean(centres, axis=0) + 0.5 * np.clip(above - below, -size / 4, size / 4)
     cx, cy = 0.5 * span - middle
