@@ -35,7 +35,7 @@ class TimeSurface:
 
     def render(self, ages: U16, table: F32) -> F32:
         """(height, width) float32 in 0..1 of ages (h, w) on the sensor grid, with ``table`` from ``decay_table``."""
-        surface = table[ages]
+        surface = np.take(table, ages)
         if self._maps is not None:
             return np.asarray(cv2.remap(surface, *self._maps, cv2.INTER_LINEAR))
         return np.ascontiguousarray(surface[:, ::-1]) if self._mirrored else surface

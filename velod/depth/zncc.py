@@ -121,6 +121,23 @@ def _correlate(
 
 
 @njit(cache=True, nogil=True)
+def _normalise(scores: F32, total: F64, squares: F64, xm: int, y: int, half: int, var_reference: float) -> None:
+    """Covariances to correlations: divide by both deviations; -1 where the candidate is flat."""
+    n = scores.shape[0]
+    area = float((2 * half + 1) ** 2)
+    # The block of disparity d lies between columns d and d + size of these rows of the integral images.
+    size = 2 * half + 1
+    top, bottom = total[y - half, xm - half :], total[y + half + 1, xm - half :]
+    top2, bottom2 = squares[y - half, xm - half :], squares[y + half + 1, xm - half :]
+    for d in range(n):
+        s = bottom[d + size] - top[d + size] - bottom[d] + top[d]
+        var = bottom2[d + size] - top2[d + size] - bottom2[d] + top2[d] - s * s / area
+        flat = var < _FLAT * area
+        root = math.sqrt(var_reference * (1.0 if flat else var))
+        scores[d] = np.float32(-1.0 if flat else scores[d] / root)
+
+
+@njit(cache=True, nogil=True)
 def _match(
     reference: F32,
     total: F64,
@@ -157,13 +174,9 @@ def _match(
         xm = w - 1 - xk
         n = min(max_disparity, xk - half) + 1
         _correlate(reference, mirrored, xk, yk, xm, half, sum_l / area, row, scores[:n])
+        _normalise(scores[:n], mirrored_total, mirrored_squares, xm, yk, half, var_l)
         best = 0
         for d in range(n):
-            sum_r = _block_sum(mirrored_total, xm + d, yk, half)
-            var_r = _block_sum(mirrored_squares, xm + d, yk, half) - sum_r * sum_r / area
-            scores[d] = (
-                scores[d] / np.float32(math.sqrt(var_l * var_r)) if var_r >= _FLAT * area else np.float32(-1.0)
-            )
             if scores[d] > scores[best]:
                 best = d
         score[k] = scores[best]
