@@ -6,6 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
+import numpy as np
+
 from velod.geometry.calibration import Calibration
 from velod.types import F32, F64, I64, U8, U16
 
@@ -22,6 +24,9 @@ class EventColumns:
     x: U16  # (n,) column, px
     y: U16  # (n,) row, px
     p: U8  # (n,) 1 = ON, 0 = OFF
+
+
+NO_EVENTS = EventColumns(np.empty(0, np.int64), np.empty(0, np.uint16), np.empty(0, np.uint16), np.empty(0, np.uint8))
 
 
 @dataclass(frozen=True, slots=True)

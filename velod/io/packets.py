@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from velod.io.model import EventColumns, EventSource, Imu, RecordingError
+from velod.io.model import NO_EVENTS, EventColumns, EventSource, Imu, RecordingError
 from velod.types import NS_PER_S, EventPacket, ImuPacket
 
 FINAL_WATERMARK_NS = 25_000_000
@@ -94,14 +94,11 @@ def _event_packets(
             seq += 1
         yield _packet(seq, edge, camera, events, slice(cut, n))
         seq += 1
-    yield _packet(seq, end_ns + FINAL_WATERMARK_NS, camera, _EMPTY, slice(0, 0))
+    yield _packet(seq, end_ns + FINAL_WATERMARK_NS, camera, NO_EVENTS, slice(0, 0))
 
 
 def _packet(seq: int, t_ns: int, camera: str, events: EventColumns, part: slice) -> EventPacket:
     return EventPacket(seq, t_ns, camera, events.x[part], events.y[part], events.t_ns[part], events.p[part])
-
-
-_EMPTY = EventColumns(np.empty(0, np.int64), np.empty(0, np.uint16), np.empty(0, np.uint16), np.empty(0, np.uint8))
 
 
 class _Cursor:
@@ -110,7 +107,7 @@ class _Cursor:
     def __init__(self, source: EventSource) -> None:
         self._name = source.name
         self._blocks = source.blocks()
-        self._have = _EMPTY
+        self._have = NO_EVENTS
         self._last_ns: int | None = None
 
     def take_before(self, t_ns: int) -> EventColumns:
@@ -123,7 +120,7 @@ class _Cursor:
                 break
             block = next(self._blocks, None)
             if block is None:
-                self._have = _EMPTY
+                self._have = NO_EVENTS
                 break
             self._check_order(block)
             self._have = block
@@ -150,7 +147,7 @@ def _slice(events: EventColumns, start: int, stop: int | None) -> EventColumns:
 def _concatenate(parts: list[EventColumns]) -> EventColumns:
     parts = [part for part in parts if len(part.t_ns) > 0]
     if not parts:
-        return _EMPTY
+        return NO_EVENTS
     if len(parts) == 1:
         return parts[0]
     return EventColumns(

@@ -1,0 +1,122 @@
+"""A pinned texture of overlapping leaves, with the pyramid that filters it at a pixel's footprint.
+
+Dead leaves (Lee, Mumford, Huang, IJCV 2001): ellipses and rectangles of power-law sizes cover one another:
+sharp edges in all directions at all scales, as in pictures of real places.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from velod.types import F32, F64, I64
+
+SIZE = 2048
+"""Side of the texture at its finest level, texels; a power of two."""
+
+TEXEL_M = 0.004
+"""Side of a texel of the finest level on every surface, m. The texture repeats every SIZE * TEXEL_M = 8.2 m."""
+
+
+@dataclass(frozen=True, slots=True)
+class Texture:
+    """Levels of halved resolution in one array: level k has (SIZE >> k)^2 texels from ``offset[k]`` on."""
+
+    texels: F32  # linear intensity, 0..1
+    offset: I64  # (levels,)
+
+
+@dataclass(frozen=True, slots=True)
+class TextureRecipe:
+    """What the leaves look like."""
+
+    leaves: int = 1800
+    smallest_m: float = 0.1  # radius
+    largest_m: float = 0.8
+    darkest: float = 0.08  # intensities are log-uniform between this and 1
+    seed: int = 1
+
+
+def make_texture(recipe: TextureRecipe) -> Texture:
+    """Paint the leaves and build the pyramid."""
+    rng = np.random.default_rng(recipe.seed)
+    n = recipe.leaves
+    # Radii of density r^-3, as scale invariance asks.
+    low, high = recipe.smallest_m**-2, recipe.largest_m**-2
+    radius = (low - rng.random(n) * (low - high)) ** -0.5 / TEXEL_M
+    leaf = np.stack(
+        [
+            rng.random(n) * SIZE,
+            rng.random(n) * SIZE,
+            radius,
+            radius * rng.uniform(0.4, 1.0, n),
+            rng.uniform(0.0, np.pi, n),
+            (rng.random(n) < 0.5).astype(np.float64),
+            np.exp(rng.random(n) * np.log(recipe.darkest)),
+        ],
+        axis=1,
+    )
+    finest = np.full((SIZE, SIZE), 0.2, np.float32)
+    _paint(leaf, finest)
+    return _pyramid(_binomial(finest))
+
+
+@njit(cache=True, nogil=True)
+def _paint(leaf: F64, image: F32) -> None:
+    """Rows of ``leaf``: x, y, half axes (texels), angle, 1 = ellipse or 0 = rectangle, intensity; the last covers."""
+    size = image.shape[0]
+    for k in range(leaf.shape[0]):
+        x0, y0, a, b, angle, ellipse, value = leaf[k]
+        c, s = np.cos(angle), np.sin(angle)
+        reach = int(np.hypot(a, b)) + 1
+        for j in range(int(y0) - reach, int(y0) + reach + 1):
+            for i in range(int(x0) - reach, int(x0) + reach + 1):
+                p = (c * (i - x0) + s * (j - y0)) / a
+                q = (-s * (i - x0) + c * (j - y0)) / b
+                inside = p * p + q * q < 1.0 if ellipse > 0.5 else abs(p) < 1.0 and abs(q) < 1.0
+                if inside:
+                    image[j % size, i % size] = value
+
+
+def _binomial(image: F32) -> F32:
+    """Band-limit with [1 2 1]/4 both ways; the texture wraps around."""
+    for axis in (0, 1):
+        image = (np.roll(image, 1, axis) + 2.0 * image + np.roll(image, -1, axis)) / 4.0
+    return image.astype(np.float32)
+
+
+def _pyramid(level: F32) -> Texture:
+    levels = [level]
+    while len(level) > 1:
+        level = level.reshape(len(level) // 2, 2, len(level) // 2, 2).mean(axis=(1, 3), dtype=np.float32)
+        levels.append(level)
+    offset = np.cumsum([0] + [part.size for part in levels[:-1]], dtype=np.int64)
+    return Texture(np.concatenate([part.ravel() for part in levels]), offset)
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def sample(texels: F32, offset: I64, u: np.float32, v: np.float32, level: int, share: np.float32) -> np.float32:
+    """Intensity at (u, v), in texels of the finest level, between ``level`` and the next coarser one (trilinear)."""
+    fine: np.float32 = _bilinear(texels, offset[level], u, v, level)
+    coarse: np.float32 = _bilinear(texels, offset[level + 1], u, v, level + 1)
+    return fine + share * (coarse - fine)
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _bilinear(texels: F32, start: int, u: np.float32, v: np.float32, level: int) -> np.float32:
+    size = SIZE >> level
+    half = np.float32(0.5)
+    scale = np.float32(1.0) / np.float32(1 << level)
+    # The centre of texel i of a level lies at (i + 0.5) * 2^level.
+    x, y = u * scale - half, v * scale - half
+    x0, y0 = np.floor(x), np.floor(y)
+    p, q = x - x0, y - y0
+    mask = size - 1
+    i, j = int(x0) & mask, int(y0) & mask
+    i1, j1 = (i + 1) & mask, (j + 1) & mask
+    row0, row1 = start + j * size, start + j1 * size
+    top = texels[row0 + i] + p * (texels[row0 + i1] - texels[row0 + i])
+    bottom = texels[row1 + i] + p * (texels[row1 + i1] - texels[row1 + i])
+    return top + q * (bottom - top)
