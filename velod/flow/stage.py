@@ -24,9 +24,9 @@ class FlowStage:
     def __init__(self, settings: Settings, calibration: Calibration) -> None:
         self.counters: Counter[str] = Counter()
         self._settings = settings.flow
-        rectification = rectify(calibration)
-        self._xy = np.ascontiguousarray(rectification.left_xy, np.float32)
-        self._covector = np.ascontiguousarray(rectification.left_covector, np.float32)
+        self.rectification = rectify(calibration)
+        self._xy = np.ascontiguousarray(self.rectification.left_xy, np.float32)
+        self._covector = np.ascontiguousarray(self.rectification.left_covector, np.float32)
 
     def handle(self, message: EventBatch) -> list[FlowBatch]:
         """One FlowBatch per EventBatch, possibly empty; none where the batch cannot be read."""
