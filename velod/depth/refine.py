@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
+from velod.events.columns import readonly
 from velod.events.plane_fit import fit_plane
 from velod.geometry.rectify import Rectification
 from velod.types import F32, F64, I64, NS_PER_S, PATCH, U8, U16
@@ -72,8 +73,8 @@ def refine(
     n = x.shape[0]
     out = Refined(np.empty(n, np.uint8), np.empty(n), np.empty(n), np.empty(n))
     _refine(
-        left,
-        right,
+        readonly(left, np.uint16),
+        readonly(right, np.uint16),
         unit_ns / NS_PER_S,
         x.astype(np.int64),
         y.astype(np.int64),
