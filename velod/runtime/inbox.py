@@ -21,26 +21,28 @@ class Item:
 @dataclass(slots=True)
 class _Source:
     capacity: int
+    urgent: bool
     items: deque[Item] = field(default_factory=deque)
 
 
 class Inbox:
     """One queue per source, each bounded: when one is full its oldest item makes room, and that is counted.
 
-    ``put`` never blocks, so a slow worker holds up no thread of the network. ``get`` serves all sources in the
-    order of arrival.
+    ``put`` never blocks, so a slow worker holds up no thread of the network. ``get`` serves urgent sources first,
+    and otherwise all in the order of arrival.
     """
 
     def __init__(self) -> None:
         self.counters: dict[str, int] = {}
         self._sources: dict[str, _Source] = {}
         self._turns: deque[str] = deque()  # one entry per queued item
+        self._urgent_turns: deque[str] = deque()
         self._ready = threading.Condition()
 
-    def add_source(self, name: str, capacity: int) -> None:
-        """Accept items of source ``name``, ``capacity`` of them at once."""
+    def add_source(self, name: str, capacity: int, urgent: bool = False) -> None:
+        """Accept items of source ``name``, ``capacity`` of them at once; urgent ones overtake all others."""
         with self._ready:
-            self._sources[name] = _Source(capacity)
+            self._sources[name] = _Source(capacity, urgent)
 
     def put(self, source: str, key: str, data: bytes) -> None:
         """Add an item; called from any thread."""
@@ -52,18 +54,19 @@ class Inbox:
                 name = f"inbox.overflow.{source}"
                 self.counters[name] = self.counters.get(name, 0) + 1
             else:
-                self._turns.append(source)
+                (self._urgent_turns if queue.urgent else self._turns).append(source)
             queue.items.append(Item(source, key, data, time.time_ns()))
             self._ready.notify()
 
     def get(self, timeout_s: float) -> Item | None:
         """The next item; None after ``timeout_s`` without one."""
         with self._ready:
-            if not self._turns and not self._ready.wait_for(lambda: bool(self._turns), timeout_s):
+            if not self._ready.wait_for(lambda: bool(self._urgent_turns or self._turns), timeout_s):
                 return None
-            return self._sources[self._turns.popleft()].items.popleft()
+            turns = self._urgent_turns or self._turns
+            return self._sources[turns.popleft()].items.popleft()
 
     def waiting(self) -> int:
         """Items queued now."""
         with self._ready:
-            return len(self._turns)
+            return len(self._urgent_turns) + len(self._turns)

@@ -24,6 +24,7 @@ from velod.io import open_recording
 from velod.io.packets import Chunking
 from velod.runtime.health import HealthReporter
 from velod.runtime.outlet import Outlet
+from velod.runtime.prefetch import Prefetch
 from velod.runtime.session import open_session
 from velod.runtime.stages import STAGES
 from velod.runtime.worker import (
@@ -47,6 +48,8 @@ QUIET_S = 0.5
 """No velocity for so long after the last packet: that was the last one."""
 START_S = 180.0
 """A service whose kernels must be compiled first takes a while to come up."""
+PREFETCH_S = 30.0
+"""So long may reading ahead take before real-time playing starts."""
 TAIL_NS = 150_000_000
 """The last velocity lies at most so far before the end of the data."""
 
@@ -236,8 +239,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         prepare_process(args.parent)
         stop = stop_on_signals()
         packets = open_recording(args.recording).packets(args.packets)
+        ahead = Prefetch(packets)
+        if args.speed is not None:
+            ahead.fill(PREFETCH_S)
         with open_session(zenoh_settings(args)) as session:
-            play(session, args.rig, packets, args.speed, stop, args.worker)
+            play(session, args.rig, ahead, args.speed, stop, args.worker)
     except PlayerError as e:
         log.error("%s", e)
         return 1

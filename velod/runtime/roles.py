@@ -33,7 +33,7 @@ from velod.wire.topics import (
 
 OVERTAKING = 64
 """Results of several workers overtake each other by no more than this."""
-_CAME, _WENT = "alive", "gone"
+_TOKENS, _CAME, _WENT = "tokens", b"came", b"went"
 
 
 class IngestShell(WorkerShell):
@@ -50,22 +50,22 @@ class IngestShell(WorkerShell):
     def subscribe(self, stack: ExitStack) -> None:
         """The sensor, answers of workers, and their coming and going."""
         super().subscribe(stack)
-        self.listen(stack, DONE, key(DONE, self.rig))
-        self.inbox.add_source(_CAME, self.depth)
-        self.inbox.add_source(_WENT, self.depth)
+        # Word of workers overtakes the sensor: however far ingest is behind, an idle worker gets the next batch.
+        self.listen(stack, DONE, key(DONE, self.rig), urgent=True)
+        self.inbox.add_source(_TOKENS, self.depth, urgent=True)
         callback = zenoh.handlers.Callback(self._token_changed, indirect=False)
         tokens = self.session.liveliness().declare_subscriber(key(ALIVE, self.rig), callback, history=True)
         stack.enter_context(tokens)
 
     def _token_changed(self, sample: zenoh.Sample) -> None:
-        source = _CAME if sample.kind == zenoh.SampleKind.PUT else _WENT
-        self.inbox.put(source, str(sample.key_expr), b"")
+        came = sample.kind == zenoh.SampleKind.PUT
+        self.inbox.put(_TOKENS, str(sample.key_expr), _CAME if came else _WENT)
 
     def take_other(self, item: Item) -> bool:
         """Workers that come and go."""
-        if item.source not in (_CAME, _WENT):
+        if item.source != _TOKENS:
             return False
-        self._dispatch.alive(item.key, item.source == _CAME)
+        self._dispatch.alive(item.key, item.data == _CAME)
         return True
 
     def consumers(self) -> list[tuple[Topic, dict[str, str]]]:

@@ -66,8 +66,10 @@ def _tree(settings: ZenohSettings, listen: list[str], connect: bool) -> dict[str
         "listen": {"endpoints": {"peer": listen}, "exit_on_failure": True},
         "connect": {
             "endpoints": {"peer": [introducer_endpoint(settings)] if connect else []},
-            # 0: opening does not wait; the connection is made, and made again, in the background.
-            "timeout_ms": {"peer": 0},
+            # Opening does not wait, and whoever comes first is found later: tried for ever in the background.
+            # (With a timeout of 0 a first attempt that fails is the last one.)
+            "timeout_ms": {"peer": -1},
+            "exit_on_failure": {"peer": False},
             "retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2},
         },
         "scouting": {

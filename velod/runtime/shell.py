@@ -118,9 +118,9 @@ class WorkerShell:
 
     # What all roles use ---------------------------------------------------------------------------------------
 
-    def listen(self, stack: ExitStack, topic: Topic, at: str) -> None:
+    def listen(self, stack: ExitStack, topic: Topic, at: str, *, urgent: bool = False) -> None:
         """Subscribe to one topic; its messages go through the inbox."""
-        self.inbox.add_source(topic.name, self.depth)
+        self.inbox.add_source(topic.name, self.depth, urgent)
 
         def arrived(sample: zenoh.Sample) -> None:
             self.inbox.put(topic.name, str(sample.key_expr), sample.payload.to_bytes())
