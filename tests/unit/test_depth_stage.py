@@ -74,7 +74,7 @@ def test_an_edge_that_lies_in_the_row_is_not_refined_and_has_a_larger_sigma_stil
     message = batch(Edge(angle=1.5, x_px=400.0), Edge(angle=0.0, x_px=150.0))
     out, counters = run(message, min_zncc=-1.0)
     flat = out.refined == 0
-    assert counters["unrefined.flat edge"] > 20
+    assert counters["unrefined.flat_edge"] > 20
     assert flat.sum() > 0
     assert (out.sigma[flat] * 20.0 >= 0.35).all()
     assert np.max(out.sigma[flat]) * 20.0 == pytest.approx(0.7, rel=1e-5)

@@ -42,10 +42,10 @@ def twin(message: StereoBatch, rect: Rectification, k: int, seed: float) -> tupl
     x, y, p, unit = int(message.x[k]), int(message.y[k]), int(message.p[k]), message.unit_ns
     n, g, t_left, _ = plane(message.left, p, x, y, unit, 20)
     if n == 0:
-        return "no left plane", np.nan
+        return "no_left_plane", np.nan
     g_left = rect.left_covector[y, x].astype(np.float64) @ g
     if abs(g_left[0]) < module.MIN_NORMAL_X * np.linalg.norm(g_left):
-        return "flat edge", np.nan
+        return "flat_edge", np.nan
     x_left, y_left = rect.left_xy[y, x].astype(np.float64)
     x_right = x_left - seed
     for _ in range(2):
@@ -55,17 +55,17 @@ def twin(message: StereoBatch, rect: Rectification, k: int, seed: float) -> tupl
         px, py = np.rint(at).astype(int)
         n, g, t0, rms = plane(message.right, p, px, py, unit, 15)
         if n == 0:
-            return "no right plane", np.nan
+            return "no_right_plane", np.nan
         g_right = rect.right_covector[py, px].astype(np.float64) @ g
         step = (t_left - t0 - g @ (at - [px, py])) / g_right[0]
         x_right += step
         if abs(x_left - x_right - seed) >= 1.5:
-            return "too far", np.nan
+            return "too_far", np.nan
         if abs(step) < 0.75:
             if np.linalg.norm(g_right - g_left) > 0.3 * np.linalg.norm(g_left):
-                return "slopes differ", np.nan
+                return "slopes_differ", np.nan
             return ("residual", np.nan) if rms > 0.35 * np.linalg.norm(g) else ("refined", x_left - x_right)
-    return "too far", np.nan
+    return "too_far", np.nan
 
 
 @pytest.mark.parametrize("rig", [PLAIN_RIG, TILTED_RIG], ids=["rectified", "tilted"])
@@ -81,7 +81,7 @@ def test_every_outcome_and_disparity_equals_the_numpy_twins(rig: Calibration) ->
             assert OUTCOMES[result.outcome[k]] == outcome
             np.testing.assert_allclose(result.disparity[k], disparity, atol=1e-6)
             seen.add(outcome)
-    assert {"refined", "no left plane", "too far", "slopes differ"} <= seen
+    assert {"refined", "no_left_plane", "too_far", "slopes_differ"} <= seen
 
 
 @pytest.mark.parametrize("error_px", [-1.2, -0.5, 0.0, 0.6, 1.2])
@@ -110,19 +110,19 @@ def test_the_normal_and_the_residual_are_those_of_the_edge() -> None:
 
 def test_an_edge_in_the_row_an_absent_one_and_a_missing_seed_are_told_apart() -> None:
     rect = rectify(PLAIN_RIG)
-    assert outcomes(refine_batch(batch(Edge(angle=1.5, x_px=400.0)), rect, 7.37)) == {"flat edge"}
-    assert outcomes(refine_batch(without_right(batch(Edge())), rect, 7.37)) == {"no right plane"}
-    assert outcomes(refine_batch(batch(Edge()), rect, np.nan)) == {"no seed"}
+    assert outcomes(refine_batch(batch(Edge(angle=1.5, x_px=400.0)), rect, 7.37)) == {"flat_edge"}
+    assert outcomes(refine_batch(without_right(batch(Edge())), rect, 7.37)) == {"no_right_plane"}
+    assert outcomes(refine_batch(batch(Edge()), rect, np.nan)) == {"no_seed"}
 
 
 def test_an_edge_of_another_speed_is_refused() -> None:
     left, right = batch(Edge(angle=0.0)), batch(Edge(angle=0.0, speed_px_s=190.0))
     result = refine_batch(replace(left, right=right.right), rectify(PLAIN_RIG), 7.37)
     assert (result.outcome != module.REFINED).all()
-    assert "slopes differ" in outcomes(result)
+    assert "slopes_differ" in outcomes(result)
 
 
 def test_the_other_polarity_is_not_looked_at() -> None:
     message = batch(Edge())
     result = refine_batch(replace(message, right=message.right[::-1].copy()), rectify(PLAIN_RIG), 7.37)
-    assert outcomes(result) == {"no right plane"}
+    assert outcomes(result) == {"no_right_plane"}

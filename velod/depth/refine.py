@@ -35,12 +35,12 @@ MIN_NORMAL_X = 0.15
 REFINED, NO_SEED, NO_LEFT_PLANE, FLAT_EDGE, NO_RIGHT_PLANE, FAR, SLOPES, RESIDUAL = range(8)
 OUTCOMES = (
     "refined",
-    "no seed",
-    "no left plane",
-    "flat edge",
-    "no right plane",
-    "too far",
-    "slopes differ",
+    "no_seed",
+    "no_left_plane",
+    "flat_edge",
+    "no_right_plane",
+    "too_far",
+    "slopes_differ",
     "residual",
 )
 """Names of the outcomes, in the order of their numbers."""

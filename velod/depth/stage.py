@@ -61,8 +61,10 @@ class DepthStage:
         """The surfaces and the events are on the sensors of the calibration."""
         h, w = self._left_shape
         return (
-            message.left.shape[1:] == message.left_last.shape == self._left_shape
-            and message.right.shape[1:] == message.right_last.shape == self._right_shape
+            message.left.shape == (2, *self._left_shape)
+            and message.left_last.shape == self._left_shape
+            and message.right.shape == (2, *self._right_shape)
+            and message.right_last.shape == self._right_shape
             and int(message.x.max(initial=0)) < w
             and int(message.y.max(initial=0)) < h
             and int(message.p.max(initial=0)) < 2
