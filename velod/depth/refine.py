@@ -21,7 +21,8 @@ from velod.types import F32, F64, I64, NS_PER_S, PATCH, U8, U16
 _REJECT_PX = 1.0
 _REJECTIONS = 2
 _MIN_NEIGHBOURS = 20
-# Fewer on the right, whose patch is placed by a match that may be a pixel off: only its time is used, not its slope.
+# Fewer on the right, whose patch is placed by a match that may be a pixel off: its slope only turns a time
+# difference into a short way.
 _MIN_NEIGHBOURS_RIGHT = 15
 # Acceptance: the last step, the total way from the coarse match, the relative difference of slopes, the residual.
 _MAX_STEP_PX = 0.75
