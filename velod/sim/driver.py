@@ -17,8 +17,8 @@ import numpy as np
 
 from velod.io.model import RecordingError
 from velod.io.recording import open_recording
-from velod.sim.sequences import sequence
 from velod.sim.run import Progress, simulate
+from velod.sim.sequences import sequence
 
 MODEL_VERSION = 1
 """Raised with every change of the simulator that changes what it records."""

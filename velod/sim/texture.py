@@ -101,7 +101,8 @@ def sample(texels: F32, offset: I64, u: np.float32, v: np.float32, level: int, s
     """Intensity at (u, v), in texels of the finest level, between ``level`` and the next coarser one (trilinear)."""
     fine: np.float32 = _bilinear(texels, offset[level], u, v, level)
     coarse: np.float32 = _bilinear(texels, offset[level + 1], u, v, level + 1)
-    return fine + share * (coarse - fine)
+    blend: np.float32 = fine + share * (coarse - fine)
+    return blend
 
 
 @njit(cache=True, nogil=True, fastmath=True)
@@ -119,4 +120,5 @@ def _bilinear(texels: F32, start: int, u: np.float32, v: np.float32, level: int)
     row0, row1 = start + j * size, start + j1 * size
     top = texels[row0 + i] + p * (texels[row0 + i1] - texels[row0 + i])
     bottom = texels[row1 + i] + p * (texels[row1 + i1] - texels[row1 + i])
-    return top + q * (bottom - top)
+    blend: np.float32 = top + q * (bottom - top)
+    return blend
