@@ -121,7 +121,7 @@ def run_online(
 
 def _wait_until_up(supervisor: Supervisor, collector: _Collector, stop: Event | None) -> None:
     deadline_s = time.monotonic() + START_S
-    while not supervisor.is_up() and not (stop is not None and stop.is_set()):
+    while not (supervisor.is_up() and supervisor.spare_is_settled) and not (stop is not None and stop.is_set()):
         _step(supervisor, collector)
         if time.monotonic() > deadline_s:
             raise OnlineError(f"the service is not up after {START_S:.0f} s")

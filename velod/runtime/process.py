@@ -27,8 +27,9 @@ def to_stderr(line: str) -> None:
 class ChildProcess:
     """One child. Its log lines go to ``on_line``; the last ones are kept to tell why it died.
 
-    It has a session of its own, so that Ctrl-C in the terminal reaches the supervisor alone, which then stops its
-    children in good order.
+    It has a process group of its own, so that Ctrl-C in the terminal reaches the supervisor alone, which then stops
+    its children in good order; not a session of its own, because schedulers may share out the time by sessions first,
+    and then low priority means nothing between processes.
     """
 
     def __init__(self, command: Sequence[str], on_line: LineSink = to_stderr) -> None:
@@ -42,7 +43,7 @@ class ChildProcess:
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             env=_environment(),
-            start_new_session=True,
+            process_group=0,
             text=True,
             errors="replace",
         )

@@ -1,89 +1,98 @@
 """A warm spare: a process with everything loaded that waits to be told which dead worker it replaces.
 
 It reads one line of JSON from stdin, ``{"become": "flow-0"}``. A fresh process would need seconds to import and to
-load kernels; the spare is at work in a fraction of one.
+load kernels; the spare is at work in a fraction of one. What it loads, it loads in threads of low priority (Linux
+keeps a niceness per thread), so as not to slow the workers; the main thread, which will be a worker, only waits.
+For the same reason this module imports nothing but the standard library at first.
 """
 
 from __future__ import annotations
 
 import json
-import logging
 import os
 import select
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from threading import Event
+from typing import TYPE_CHECKING, TypeVar
 
-from velod.config import Settings
-from velod.geometry.calibration import Calibration
-from velod.runtime.session import open_session
-from velod.runtime.settings_service import fetch
-from velod.runtime.stages import STAGES, Stage, stage_of
-from velod.runtime.worker import (
-    EXIT_USAGE,
-    load_stages,
-    prepare_process,
-    serve_stage,
-    start_logging,
-    stop_on_signals,
-    worker_parser,
-    zenoh_settings,
-)
+if TYPE_CHECKING:
+    from velod.config import Settings
+    from velod.geometry.calibration import Calibration
+    from velod.runtime.stages import Stage
 
 READY = "ready"
-_NICENESS = 15
+_NICENESS = 19
 _POLL_S = 0.1
 
-log = logging.getLogger("velod")
+T = TypeVar("T")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Wait, then be a worker; returns the exit code."""
-    parser = worker_parser("python -P -m velod.runtime.spare", worker="")
-    parser.add_argument("--stages", default=",".join(STAGES), help="which stages it is to stand by for")
+    quietly(_import_all)
+    from velod.runtime import worker
+    from velod.runtime.session import open_session
+    from velod.runtime.settings_service import fetch
+    from velod.runtime.stages import stage_of
+
+    parser = worker.worker_parser("python -P -m velod.runtime.spare", worker="")
+    parser.add_argument("--stages", required=True, help="which stages it is to stand by for, a,b,c")
     args = parser.parse_args(argv)
-    start_logging("spare")
     try:
-        prepare_process(args.parent)
-        stop = stop_on_signals()
-        with open_session(zenoh_settings(args)) as session:
+        worker.prepare_process(args.parent)
+        stop = worker.stop_on_signals()
+        with open_session(worker.zenoh_settings(args)) as session:
             settings, calibration = fetch(session, args.rig, args.connect)
-            stages = _load_in_background(settings, calibration, args.stages.split(","))
+            stages = quietly(lambda: _load(settings, calibration, args.stages.split(",")))
             print(READY, flush=True)
-            worker = _wait_for_order(stop)
-            if worker:
-                start_logging(worker)
-                serve_stage(session, settings, worker, stages[stage_of(worker)], stop)
+            name = _wait_for_order(stop)
+            if name:
+                worker.start_logging(name)
+                worker.serve_stage(session, settings, name, stages[stage_of(name)], stop)
     except (OSError, ValueError) as e:
-        log.error("%s", e)
-        return EXIT_USAGE
+        worker.log.error("%s", e)
+        return worker.EXIT_USAGE
     return 0
 
 
-def _load_in_background(settings: Settings, calibration: Calibration, names: Sequence[str]) -> dict[str, Stage]:
-    """Load stages in a thread of low priority, so as not to slow the workers that are busy.
+def quietly(work: Callable[[], T]) -> T:
+    """The result of ``work``, done in a thread of low priority. Raises what it raised."""
+    results: list[T] = []
+    failures: list[BaseException] = []
 
-    Raises whatever loading raised.
-    """
-    loaded: dict[str, Stage] = {}
-    failure: list[Exception] = []
-
-    def load() -> None:
-        # Linux keeps a niceness per thread: the main thread, which will be a worker, stays as it is.
+    def run() -> None:
         if sys.platform == "linux":
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICENESS)
         try:
-            loaded.update(load_stages(settings, calibration, names))
-        except Exception as e:
-            failure.append(e)
+            results.append(work())
+        except BaseException as e:
+            failures.append(e)
 
-    thread = threading.Thread(target=load)
+    thread = threading.Thread(target=run)
     thread.start()
     thread.join()
-    if failure:
-        raise failure[0]
-    return loaded
+    if failures:
+        raise failures[0]
+    return results[0]
+
+
+def _import_all() -> None:
+    from velod.runtime import stages, warmup, worker
+
+    worker.start_logging("spare")
+    warmup.ensure_cache_directory()
+    stages.import_all()
+
+
+def _load(settings: Settings, calibration: Calibration, names: Sequence[str]) -> dict[str, Stage]:
+    """Stages ready for their first message: kernels loaded, tables made."""
+    from velod.runtime import stages, warmup
+
+    for name in names:
+        warmup.warm_up(name, settings, calibration)
+    return {name: stages.create_stage(name, settings, calibration) for name in names}
 
 
 def _wait_for_order(stop: Event) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from importlib import import_module
 from typing import Any, Protocol
 
 from velod.config import Settings
@@ -25,25 +26,27 @@ class Stage(Protocol):
         ...
 
 
+_CLASSES = {
+    "ingest": ("velod.ingest.stage", "IngestStage"),
+    "flow": ("velod.flow.stage", "FlowStage"),
+    "depth": ("velod.depth.stage", "DepthStage"),
+    "optimizer": ("velod.optimizer.stage", "OptimizerStage"),
+}
+
+
 def create_stage(name: str, settings: Settings, calibration: Calibration) -> Stage:
-    """The stage of this name, one of STAGES. Imports it only now, so that a worker loads no other stage's code."""
-    if name == "ingest":
-        from velod.ingest.stage import IngestStage
+    """The stage of this name. Imports it only now, so that a worker loads no other stage's code."""
+    if name not in _CLASSES:
+        raise ValueError(f"no stage {name!r}; stages: {', '.join(STAGES)}")
+    module, class_name = _CLASSES[name]
+    stage: Stage = getattr(import_module(module), class_name)(settings, calibration)
+    return stage
 
-        return IngestStage(settings, calibration)
-    if name == "flow":
-        from velod.flow.stage import FlowStage
 
-        return FlowStage(settings, calibration)
-    if name == "depth":
-        from velod.depth.stage import DepthStage
-
-        return DepthStage(settings, calibration)
-    if name == "optimizer":
-        from velod.optimizer.stage import OptimizerStage
-
-        return OptimizerStage(settings, calibration)
-    raise ValueError(f"no stage {name!r}; stages: {', '.join(STAGES)}")
+def import_all() -> None:
+    """Import the code of all stages."""
+    for module, _ in _CLASSES.values():
+        import_module(module)
 
 
 def alarms_of(stage: Stage) -> dict[str, str]:

@@ -158,6 +158,11 @@ class Supervisor:
         """Whether a worker that dies now is replaced at once."""
         return self._spare is not None and self._spare.has_said(READY)
 
+    @property
+    def spare_is_settled(self) -> bool:
+        """Whether the spare is ready, or none is wanted: loading it takes time from the others."""
+        return self.spare_is_ready or not self._wants_spare
+
     def restarts(self) -> dict[str, int]:
         """How often each worker was restarted."""
         return {s.worker: s.restarts for s in self._slots.values()}

@@ -15,7 +15,6 @@ from threading import Event
 import zenoh
 
 from velod.config import Settings, ZenohSettings
-from velod.geometry.calibration import Calibration
 from velod.runtime import warmup
 from velod.runtime.roles import SHELLS
 from velod.runtime.session import introducer_endpoint, open_session
@@ -56,13 +55,6 @@ def serve_stage(session: zenoh.Session, settings: Settings, worker: str, stage: 
     gc.freeze()
     name = stage_of(worker)
     SHELLS[name](session, settings, name, worker, stage).run(stop)
-
-
-def load_stages(settings: Settings, calibration: Calibration, names: Sequence[str]) -> dict[str, Stage]:
-    """Stages ready for their first message: kernels loaded, tables made."""
-    for name in names:
-        warmup.warm_up(name, settings, calibration)
-    return {name: create_stage(name, settings, calibration) for name in names}
 
 
 def worker_arguments(settings: ZenohSettings, rig: str, worker: str) -> list[str]:
