@@ -119,6 +119,11 @@ class DepthSettings:
     left_right_px: float = _f(1.0, "left-right disagreement allowed, px", above=0.0, hi=10.0)
     uniqueness: float = _f(0.95, "second peak at most this share of the first", above=0.0, hi=1.0)
     refine: bool = _f(True, "plane-coincidence refinement in the right surface")
+    block_only: str = _f(
+        "flat",
+        "unrefined matches to keep: 'flat': those at near-horizontal edges, which cannot be refined; or 'all'",
+        choices=("flat", "all"),
+    )
     sigma_zncc_px: float = _f(0.35, "disparity sigma of block matching alone, px", above=0.0, hi=10.0)
     sigma_refined_px: float = _f(
         0.05, "disparity sigma of a refined match at a vertical edge, px", above=0.0, hi=10.0
@@ -163,7 +168,7 @@ class ImuSettings:
     accel_bias_walk: float = _f(4.33e-3, "accelerometer bias random walk, m/s^2/sqrt(s)", above=0.0, hi=1.0)
     gyro_bias_walk: float = _f(2.66e-4, "gyroscope bias random walk, rad/s/sqrt(s)", above=0.0, hi=1.0)
     accel_bias_sigma: float = _f(0.05, "accelerometer bias at start, 1 sigma, m/s^2", above=0.0, hi=5.0)
-    gyro_bias_sigma: float = _f(0.01, "gyroscope bias at start, 1 sigma, rad/s", above=0.0, hi=1.0)
+    gyro_bias_sigma: float = _f(0.005, "gyroscope bias at start, 1 sigma, rad/s", above=0.0, hi=1.0)
     gravity: float = _f(9.81, "m/s^2", lo=1.0, hi=20.0)
 
 

@@ -20,8 +20,9 @@ Bools = NDArray[np.bool_]
 # Residual of the planes for which a refined match has just the sigma of the settings, and the least sigma's share.
 _TYPICAL_RMS_PX = 0.2
 _LEAST_SIGMA_SHARE = 0.3
-# Block matching along an edge that lies in the row: measured spread against that of other edges.
-_FLAT_EDGE_FACTOR = 2.0
+# Block matching along an edge that lies in the row: twice the spread of other edges, and an error that neighbours
+# share, so that it must not average out.
+_FLAT_EDGE_FACTOR = 4.0
 
 
 class DepthStage:
@@ -42,7 +43,8 @@ class DepthStage:
         """One DepthBatch for a StereoBatch; none (counted ``batches.size``) where it does not fit the calibration.
 
         Counters: ``points`` seen, of them ``points.refined`` and ``points.block`` published, ``points.no_match``,
-        ``points.low_zncc``, ``points.ambiguous`` and ``points.too_far`` dropped, and ``unrefined.<why>``.
+        ``points.unconfirmed``, ``points.low_zncc``, ``points.ambiguous`` and ``points.too_far`` dropped, and
+        ``unrefined.<why>``.
         """
         if not self._fits(message):
             self.counters["batches.size"] += 1
@@ -54,7 +56,7 @@ class DepthStage:
         refined = self._refine(message, matches.disparity)
         is_refined = refined.outcome == REFINED
         disparity = np.where(is_refined, refined.disparity, matches.disparity)
-        accepted = self._accept(left, right_mirrored, x, y, matches, disparity, is_refined)
+        accepted = self._accept(left, right_mirrored, x, y, matches, disparity, refined.outcome)
         return [self._publish(message, disparity, self._sigma_px(refined), is_refined, accepted)]
 
     def _fits(self, message: StereoBatch) -> bool:
@@ -108,12 +110,15 @@ class DepthStage:
         y: I64,
         matches: Matches,
         disparity: F64,
-        is_refined: Bools,
+        outcome: NDArray[np.uint8],
     ) -> Bools:
         """(n,) which disparities stand: refined or of a strong match, and checked against ambiguity."""
         s = self._settings
         matched = np.isfinite(disparity)
-        strong = is_refined | (matched & matches.enclosed & (matches.score >= s.min_zncc))
+        is_refined = np.asarray(outcome == REFINED)
+        # On real events every sixth match that refinement could have confirmed and did not is off by half its depth.
+        trusted = is_refined | (outcome == FLAT_EDGE) if s.refine and s.block_only == "flat" else matched
+        strong = is_refined | (matched & trusted & matches.enclosed & (matches.score >= s.min_zncc))
         accepted = strong
         if s.check == "left-right":
             # Refined ones as well: on real events one in thirty sits on the wrong edge of a repetitive texture, and
@@ -122,7 +127,8 @@ class DepthStage:
         elif s.check == "uniqueness":
             accepted = is_refined | (strong & (matches.second <= s.uniqueness * matches.score))
         self.counters["points.no_match"] += int(np.count_nonzero(~matched))
-        self.counters["points.low_zncc"] += int(np.count_nonzero(matched & ~strong))
+        self.counters["points.unconfirmed"] += int(np.count_nonzero(matched & ~trusted))
+        self.counters["points.low_zncc"] += int(np.count_nonzero(matched & trusted & ~strong))
         self.counters["points.ambiguous"] += int(np.count_nonzero(strong & ~accepted))
         return accepted
 
