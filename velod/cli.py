@@ -5,12 +5,13 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
 from velod import __version__
+from velod.cli_exit import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE, RunFailed
 
-EXIT_FAILED = 1  # the run went wrong, or its result is not good enough
-EXIT_USAGE = 2  # the user can put it right: a file, a setting, a port
-EXIT_INTERRUPTED = 130
+if TYPE_CHECKING:
+    from velod.cli_play import PlayOptions
 
 LOCAL = "tcp/127.0.0.1:17447"
 
@@ -26,8 +27,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         return EXIT_INTERRUPTED
     except BrokenPipeError:
         # The reader of the pipe (head, less) has seen enough. Python's own flush at exit must not complain again.
-        sys.stdout = None  # type: ignore[assignment]
+        sys.stdout = None
         return 0
+    except RunFailed as e:
+        print(f"velod: failed: {_one_line(e)}", file=sys.stderr)
+        return EXIT_FAILED
     except (ValueError, OSError) as e:
         # ConfigError, CalibrationError, RecordingError and SessionError are of these kinds.
         print(f"velod: error: {_one_line(e)}", file=sys.stderr)
@@ -67,10 +71,10 @@ def _eval(args: argparse.Namespace) -> int:
     return evaluate_files(args.config, args.files, _play_options(args), args.json, args.plot)
 
 
-def _play_options(args: argparse.Namespace) -> object:
+def _play_options(args: argparse.Namespace) -> PlayOptions:
     from velod.cli_play import PlayOptions
 
-    return PlayOptions(offline=args.offline, speed=args.speed, packets=args.packets, format=args.format)
+    return PlayOptions(offline=args.offline, speed=args.speed, packets=args.packets)
 
 
 def _sim(args: argparse.Namespace) -> int:
@@ -112,7 +116,7 @@ def _config_check(args: argparse.Namespace) -> int:
 def _config_calibration(args: argparse.Namespace) -> int:
     from velod.cli_config import calibration
 
-    return calibration(args.file)
+    return calibration(args.file, args.imu)
 
 
 def _warmup(args: argparse.Namespace) -> int:
@@ -189,9 +193,6 @@ def _add_play_options(parser: argparse.ArgumentParser) -> None:
         default="200hz",
         metavar="HOW",
         help="how the driver cuts the stream: 200hz, 1000hz, 60hz, random, random:SEED (default 200hz)",
-    )
-    parser.add_argument(
-        "--format", choices=("sequence", "dsec", "text"), help="of the recording (default: from what is there)"
     )
 
 
@@ -352,7 +353,10 @@ examples:
     check.add_argument("file", metavar="FILE")
     check.set_defaults(command=_config_check)
     calibration = actions.add_parser("calibration", help="read a calibration and show it as velod's YAML")
-    calibration.add_argument("file", metavar="FILE")
+    calibration.add_argument(
+        "file", metavar="FILE", help="velod's own, Kalibr's camchain, or the left.yaml of a ROS pair"
+    )
+    calibration.add_argument("imu", nargs="?", metavar="IMU", help="Kalibr: file with T_cam_imu, where it is another")
     calibration.set_defaults(command=_config_calibration)
 
 

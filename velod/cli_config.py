@@ -4,14 +4,27 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from velod import config
 from velod.config import ConfigError, Settings
+
+if TYPE_CHECKING:
+    from velod.geometry.calibration import Calibration
 
 
 def settings_of(path: str | None) -> Settings:
     """The settings of a file, or the defaults. Raises ConfigError."""
     return Settings() if path is None else config.load(path)
+
+
+def calibration_of(settings: Settings) -> Calibration | None:
+    """The calibration that the settings name, if they do. Raises CalibrationError."""
+    if not settings.rig.calibration:
+        return None
+    from velod.geometry.calibration import load_calibration
+
+    return load_calibration(settings.rig.calibration)
 
 
 def show(path: str | None) -> int:
@@ -34,20 +47,16 @@ def init(path: str, *, force: bool) -> int:
 
 def check(path: str) -> int:
     """Say whether velod would take a settings file, and the calibration that it names."""
-    settings = config.load(path)
-    if settings.rig.calibration:
-        from velod.geometry.calibration import load_calibration
-
-        load_calibration(settings.rig.calibration)
+    calibration_of(config.load(path))
     print(f"{path}: good")
     return 0
 
 
-def calibration(path: str) -> int:
+def calibration(path: str, imu_path: str | None) -> int:
     """Read a calibration of any known kind and print it as velod's own YAML."""
     import yaml
 
     from velod.geometry.calibration import load_calibration
 
-    yaml.safe_dump(load_calibration(path).to_tree(), sys.stdout, sort_keys=False)
+    yaml.safe_dump(load_calibration(path, imu_path).to_tree(), sys.stdout, sort_keys=False)
     return 0

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import csv
 import json
+import logging
 import math
 import sys
 import time
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, TextIO
+from threading import Lock
+from typing import Any
 
 import numpy as np
 
@@ -48,46 +50,69 @@ def write_json(path: str, value: Any) -> None:
 
 
 class Line:
-    """One line of a terminal that is drawn over and over; silent where the stream is not a terminal."""
+    """One line of a terminal that is drawn over and over; silent where stderr is not a terminal."""
 
-    def __init__(self, stream: TextIO | None = None) -> None:
-        self._stream = sys.stderr if stream is None else stream
-        self.enabled = self._stream.isatty()
+    def __init__(self) -> None:
+        self.enabled = sys.stderr.isatty()
         self._next_s = 0.0
-        self._drawn = False
+        self._text = ""
+        self._lock = Lock()  # log lines come from other threads
 
     def due(self) -> bool:
         """Whether it is time to draw again."""
         return self.enabled and time.monotonic() >= self._next_s
 
     def draw(self, text: str) -> None:
+        """Show ``text`` in place of what was there."""
         self._next_s = time.monotonic() + _REDRAW_S
-        self._drawn = True
-        self._stream.write(f"\r\x1b[K{text}")
-        self._stream.flush()
+        with self._lock:
+            self._text = text
+            self._write(f"\r\x1b[K{text}")
+
+    def log(self, text: str) -> None:
+        """Write a line of its own above the live one."""
+        with self._lock:
+            self._write(f"\r\x1b[K{text}\n{self._text}" if self._text else f"{text}\n")
+
+    def log_trouble(self, text: str) -> None:
+        """Write a process's log line unless it only says that all goes well."""
+        if " INFO " not in text:
+            self.log(text)
 
     def finish(self) -> None:
         """Leave the last state on the screen and go to the next line."""
-        if self._drawn:
-            self._stream.write("\n")
-            self._stream.flush()
-            self._drawn = False
+        with self._lock:
+            if self._text:
+                self._write("\n")
+            self._text = ""
+
+    @staticmethod
+    def _write(text: str) -> None:
+        sys.stderr.write(text)
+        sys.stderr.flush()
+
+
+def log_above(line: Line) -> None:
+    """Send this process's own warnings above the live line."""
+
+    class Handler(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            line.log(self.format(record))
+
+    logging.basicConfig(level=logging.WARNING, handlers=[Handler()], format="%(levelname)s %(message)s", force=True)
 
 
 class VelocityLine:
     """The live line of a run: rate, speed with its sigma, latency and state."""
 
     def __init__(self) -> None:
-        self._line = Line()
+        self.line = Line()
         self._times_s: deque[float] = deque(maxlen=75)
 
     def show(self, v: Velocity, latency_ms: float) -> None:
         self._times_s.append(time.monotonic())
-        if self._line.due():
-            self._line.draw(describe_velocity(v, self._rate_hz(), latency_ms))
-
-    def finish(self) -> None:
-        self._line.finish()
+        if self.line.due():
+            self.line.draw(describe_velocity(v, self._rate_hz(), latency_ms))
 
     def _rate_hz(self) -> float:
         span_s = self._times_s[-1] - self._times_s[0]

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from velod.cli_config import settings_of
+from velod.cli_exit import EXIT_FAILED
 from velod.cli_report import describe_velocity
 from velod.client import Listener, Received
 from velod.runtime.session import introducer_endpoint
@@ -55,7 +56,7 @@ def echo(
             received = listener.receive(math.inf if timeout_s is None else timeout_s)
             if received is None:
                 print(f"velod: no {topic} of rig {place.rig} in {timeout_s:g} s ({place.connect})", file=sys.stderr)
-                return 1
+                return EXIT_FAILED
             print(describe(received), flush=True)
             printed += 1
     return 0
@@ -93,7 +94,7 @@ def top(config: str | None, connect: str | None, rig: str | None, *, once: bool)
         if once:
             _collect(listener, newest, _DISCOVERY_S, until_complete=True)
             print(table(place, newest, listener.alive()))
-            return 0 if newest else 1
+            return 0 if newest else EXIT_FAILED
         while True:
             _collect(listener, newest, _REFRESH_S, until_complete=False)
             sys.stdout.write(f"{_CLEAR_SCREEN}{table(place, newest, listener.alive())}\n")
@@ -142,7 +143,7 @@ def _lines(worker: str, received: Received | None, alive: bool) -> list[str]:
         f"{worker:<14}{state:<8}{f'{h.pid}@{h.host}'[:21]:<22}{h.uptime_s:8.0f}{_rate(h, 'in.'):8.1f}"
         f"{_rate(h, 'out.'):8.1f}{p50:>8}{p99:>8}{sum(gaps.values()):7d}{sum(drops.values()):7d}  {name}".rstrip()
     )
-    notes = [f"    {cause}: {n}" for cause, n in sorted({**gaps, **drops}.items()) if n]
+    notes = [f"    {cause}: {n}" for cause, n in sorted({**gaps, **drops}.items())]
     alarms = [f"    ALARM {alarm}: {what}" for alarm, what in sorted(h.alarms.items())]
     return [line, *notes, *alarms]
 
@@ -160,10 +161,14 @@ def _rate(h: Health, prefix: str) -> float:
     return sum(rate for name, rate in h.rates.items() if name.startswith(prefix))
 
 
+_LOSS_PREFIXES = (
+    *("packets.", "events.", "imu.", "clock.", "batch.", "batches."),  # refused or missed by a stage
+    *("inbox.", "dispatch.", "wire.", "key.", "error.", "restart."),  # on the way between processes
+)
+
+
 def losses(counters: dict[str, int]) -> tuple[dict[str, int], dict[str, int]]:
-    """The gaps and the drops among a process's counters; what came in and went out is neither."""
-    gaps = {name: n for name, n in counters.items() if name.startswith("gap.")}
-    drops = {
-        name: n for name, n in counters.items() if name not in gaps and not name.startswith(("in.", "out.", "done."))
-    }
+    """The gaps and the drops among a process's counters, those above zero; what merely counts work is neither."""
+    gaps = {name: n for name, n in counters.items() if n and name.startswith(("gap.", "packets.gap"))}
+    drops = {name: n for name, n in counters.items() if n and name not in gaps and name.startswith(_LOSS_PREFIXES)}
     return gaps, drops

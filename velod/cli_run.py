@@ -1,0 +1,38 @@
+"""``velod run`` and ``velod warmup``."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+from velod.cli_config import calibration_of, settings_of
+from velod.config import ConfigError, Settings
+
+
+def run(config: str | None, only: list[str] | None, connect: str | None, worker: str | None) -> int:
+    """Keep the service's processes alive until SIGINT or SIGTERM. Raises ConfigError, SessionError, ..."""
+    settings = settings_of(config)
+    if connect is not None:
+        settings = replace(settings, zenoh=replace(settings.zenoh, connect=connect))
+    calibration = calibration_of(settings)
+    if calibration is None and not settings.zenoh.connect:
+        raise ConfigError(f"{config or 'defaults'}: rig.calibration: missing; the service beside a sensor needs one")
+    from velod.runtime.stages import STAGES
+    from velod.runtime.supervisor import Supervisor
+    from velod.runtime.worker import start_logging, stop_on_signals
+
+    start_logging("supervisor")
+    stop = stop_on_signals()
+    with Supervisor(settings, calibration, only or STAGES, worker or "") as supervisor:
+        supervisor.run(stop)
+    return 0
+
+
+def warmup() -> int:
+    """Compile and cache the kernels of all stages."""
+    from velod.runtime.warmup import fill_cache
+
+    start_s = time.monotonic()
+    fill_cache(Settings())
+    print(f"kernels ready after {time.monotonic() - start_s:.1f} s")
+    return 0
