@@ -17,16 +17,13 @@ from velod.events.plane_fit import HALF, SIZE, fit_plane
 from velod.events.sae import NEVER, age_unit_ns
 from velod.types import F64, I64, PATCH, U8, U16
 
-DRAWS = 16
+DRAWS = 8
 """Candidates tried in a cell before it is the next one's turn."""
 
 GOOD = 0.5
 """Fits with an rms below this share of the gate are taken before the others."""
 
-ENOUGH = 2.0
-"""The search ends when this many times the quota are acceptable."""
-
-MAX_ASYMMETRY = 0.6
+MAX_ASYMMETRY = 0.5
 """Neighbourhoods less symmetric than this about the event are not worth a fit (0: a plane, 1: half an edge)."""
 
 I32 = NDArray[np.int32]
@@ -54,18 +51,21 @@ def select_burst(
     """First events of bursts whose edge has just passed the whole of their 5x5 neighbourhood.
 
     An event itself comes when its edge has crossed half of the neighbourhood; the plane can be fitted without bias
-    only once the other half has fired too. So an event is selected in the batch that completes it: the newest
-    stamp of its same-polarity neighbourhood on ``first`` (2, h, w), int64 ns, lies in [t_start_ns, t_end_ns), and a
-    plane leaves ``min_neighbours`` of 25 after rejection (see ``fit_plane``) with an rms below ``max_rms_px``. It is
-    at most half the memory old. ``encoded`` is ``encode_ages(first, t_end_ns, memory_ns)``; ``taken`` (2, h, w) holds
-    the stamps selected before: those are skipped, and the new ones are entered.
+    only once the other half has fired too. So an event is selected in the batch that completes it: the newest of its
+    outer same-polarity neighbours on ``first`` (2, h, w), int64 ns, lies in [t_start_ns, t_end_ns), and a plane
+    leaves ``min_neighbours`` of 25 after rejection (see ``fit_plane``) with an rms below ``max_rms_px``. It is at
+    most half the memory old, so it may be older than the batch.
+
+    ``encoded`` is ``encode_ages(first, t_end_ns, memory_ns)``. ``taken`` (2, h, w) holds the stamps selected before:
+    those are skipped, and the new ones are entered.
 
     Returns columns x, y, p in the order of the surface (p, y, x).
     """
     mask = np.zeros(first.shape, np.uint8)
-    _mark_passed(encoded, memory_ns // 2 // age_unit_ns(memory_ns), mask)
+    unit_ns = age_unit_ns(memory_ns)
+    _mark_passed(encoded, memory_ns // 2 // unit_ns, -((t_start_ns - t_end_ns) // unit_ns), mask)
     chosen = _choose(
-        first, mask, t_start_ns, t_end_ns, memory_ns, border_px, quota, seq,
+        first, mask, t_end_ns, memory_ns, border_px, quota, seq,
         True, reject_px, rejections, min_neighbours, max_rms_px, taken,
     )  # fmt: skip
     taken.reshape(-1)[chosen] = first.reshape(-1)[chosen]
@@ -91,7 +91,7 @@ def select_paper(
     mask = ((last >= t_start_ns) & (last < t_end_ns)).view(np.uint8)
     none_taken = np.full(last.shape, NEVER, np.int64)
     chosen = _choose(
-        last, mask, t_start_ns, t_end_ns, memory_ns, border_px, quota, seq,
+        last, mask, t_end_ns, memory_ns, border_px, quota, seq,
         False, time_share * memory_ns, 0, PAPER_MIN_NEIGHBOURS, 0.0, none_taken,
     )  # fmt: skip
     return _columns(chosen, last)
@@ -107,7 +107,6 @@ def _columns(chosen: I32, surface: I64) -> tuple[U16, U16, U8]:
 def _choose(
     surface: I64,
     mask: U8,
-    t_start_ns: int,
     t_end_ns: int,
     memory_ns: int,
     border_px: int,
@@ -130,17 +129,18 @@ def _choose(
     _candidates(surface, taken, mask, max(border_px, HALF), cell_px, columns, index, cell_end)
     chosen = np.empty(quota, np.int32)
     n = _take_in_turn(
-        surface, t_start_ns, t_end_ns, memory_ns, burst, tolerance, rejections, min_neighbours,
+        surface, t_end_ns, memory_ns, burst, tolerance, rejections, min_neighbours,
         max_rms_px, seq, index, cell_end, chosen,
     )  # fmt: skip
     return chosen[:n]
 
 
 @njit(cache=True, nogil=True)
-def _mark_passed(age: U16, reach: int, mask: U8) -> None:
-    """Mark pixels whose outer neighbours lie symmetrically about them in time, as on a plane.
+def _mark_passed(age: U16, reach: int, span: int, mask: U8) -> None:
+    """Mark pixels whose eight outer neighbours lie symmetrically about them in time, as on a plane.
 
-    A filter that vectorises, and spares most of the fits. ``age``, ``reach``: encoded steps; 0 counts as oldest.
+    A filter that vectorises, and spares most of the fits. The pixel's ``age`` must be within ``reach``, that of its
+    newest outer neighbour within ``span``; all in encoded steps, of which 0 counts as oldest.
     """
     _, h, w = age.shape
     if w < PATCH:
@@ -163,7 +163,8 @@ def _mark_passed(age: U16, reach: int, mask: U8) -> None:
                 symmetric = abs(a + b) + abs(c + d) + abs(e + f) + abs(g + j)
                 antisymmetric = abs(a - b) + abs(c - d) + abs(e - f) + abs(g - j)
                 plane = np.float32(symmetric) <= np.float32(MAX_ASYMMETRY) * np.float32(antisymmetric)
-                marks[i] = np.uint8(plane & (t < reach))
+                newest = min(min(min(a, b), min(c, d)), min(min(e, f), min(g, j)))
+                marks[i] = np.uint8(plane & (t < reach) & (newest + t < span))
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -199,7 +200,6 @@ def _candidates(
 @njit(cache=True, nogil=True)
 def _take_in_turn(
     surface: I64,
-    t_start_ns: int,
     t_end_ns: int,
     memory_ns: int,
     burst: bool,
@@ -222,7 +222,7 @@ def _take_in_turn(
     reserve = np.empty_like(chosen)
     n = 0
     n_reserve = 0
-    while open_cells > 0 and n < chosen.size and n + n_reserve < ENOUGH * chosen.size:
+    while open_cells > 0 and n < chosen.size:
         # The cells of one round in random order: a last, incomplete round must not favour the top of the image.
         for i in range(open_cells - 1, 0, -1):
             state = _mix(state)
@@ -239,10 +239,8 @@ def _take_in_turn(
                 top[cell] -= 1
                 index[j] = index[top[cell]]
                 k, r, c = flat // (h * w), flat // w % h, flat % w
-                newest = _ages(surface[k], r, c, t_end_ns, memory_ns, age)
+                _ages(surface[k], r, c, t_end_ns, memory_ns, age)
                 if burst:
-                    if newest > t_end_ns - t_start_ns:
-                        continue
                     rms = _burst_rms_px(age, tolerance, rejections, min_neighbours)
                     if not rms < max_rms_px:
                         continue
@@ -250,7 +248,7 @@ def _take_in_turn(
                         if n_reserve < reserve.size:
                             reserve[n_reserve] = flat
                             n_reserve += 1
-                        continue
+                        break
                 elif not _obeys_paper(age, min_neighbours, tolerance * 1e-9):
                     continue
                 if n < chosen.size:
@@ -283,16 +281,11 @@ def _below(state: np.uint64, n: int) -> int:
 
 
 @njit(cache=True, nogil=True)
-def _ages(surface: I64, r: int, c: int, t_end_ns: int, memory_ns: int, age: F64) -> int:
-    """Ages in s of the 5x5 neighbourhood, 0 where older than the memory; returns the least, ns."""
-    newest = memory_ns
+def _ages(surface: I64, r: int, c: int, t_end_ns: int, memory_ns: int, age: F64) -> None:
+    """Ages in s of the 5x5 neighbourhood, 0 where older than the memory."""
     for j in range(SIZE):
         a = t_end_ns - surface[r - HALF + j // PATCH, c - HALF + j % PATCH]
-        inside = 0 < a <= memory_ns
-        age[j] = a * 1e-9 if inside else 0.0
-        if inside and a < newest:
-            newest = a
-    return newest
+        age[j] = a * 1e-9 if 0 < a <= memory_ns else 0.0
 
 
 @njit(cache=True, nogil=True)

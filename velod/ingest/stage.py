@@ -81,7 +81,7 @@ class IngestStage:
 
     def _on_imu(self, packet: ImuPacket) -> list[Output]:
         n = len(packet.sample_t_ns)
-        if packet.accel.shape != (n, 3) or packet.gyro.shape != (n, 3):
+        if n == 0 or packet.accel.shape != (n, 3) or packet.gyro.shape != (n, 3):
             self.counters["packets.malformed"] += 1
             return []
         try:
