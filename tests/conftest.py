@@ -1,6 +1,25 @@
-"""Every run of the tests tries the same examples; a slow machine is not a failure."""
+"""What all tests share: hypothesis' settings, and simulated recordings."""
 
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
 from hypothesis import HealthCheck, settings
 
+from velod.sim import simulated_recording
+
+# Every run tries the same examples; a slow machine is not a failure.
 settings.register_profile("velod", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("velod")
+
+
+@pytest.fixture(scope="session")
+def simulated(pytestconfig: pytest.Config) -> Callable[[str, float], Path]:
+    """Makes recordings of simulated sequences: ``simulated("corridor-1", 0.6)``; kept in pytest's cache."""
+
+    def make(name: str, seconds: float) -> Path:
+        with pytest.MonkeyPatch.context() as environment:
+            environment.setenv("VELOD_CACHE_DIR", str(pytestconfig.cache.mkdir("velod")))
+            return simulated_recording(name, seconds, seed=1)
+
+    return make

@@ -129,9 +129,14 @@ def evaluate(velocities: Sequence[Velocity], truth: Truth, t_start_ns: int | Non
 
 def truth_at(truth: Truth, t_ns: I64) -> F64:
     """True v_B, (n, 3) m/s, linearly interpolated at ``t_ns``, which must lie within the truth's span."""
+    return interpolated(truth.t_ns, truth.v_B, t_ns)
+
+
+def interpolated(known_t_ns: I64, values: F64, t_ns: I64) -> F64:
+    """Columns of ``values`` (k, c), known at ``known_t_ns``, linearly interpolated at ``t_ns`` (n,): (n, c)."""
     # Relative to the first sample: float64 holds ns exactly over 100 days only.
-    at, known = (t_ns - truth.t_ns[0]).astype(np.float64), (truth.t_ns - truth.t_ns[0]).astype(np.float64)
-    return np.stack([np.interp(at, known, truth.v_B[:, i]) for i in range(3)], axis=1)
+    at, known = (t_ns - known_t_ns[0]).astype(np.float64), (known_t_ns - known_t_ns[0]).astype(np.float64)
+    return np.stack([np.interp(at, known, column) for column in values.T], axis=1)
 
 
 def nees(error: F64, cov: F64) -> F64:
