@@ -1,0 +1,263 @@
+"""kill -9, SIGTERM, SIGSTOP, garbage: what happens to real processes, and that the service lives."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from velod.config import Settings, ZenohSettings
+from velod.io import open_recording
+from velod.runtime.online import OnlineResult, run_online
+from velod.runtime.player import player_command
+from velod.runtime.session import SessionError, open_session
+from velod.runtime.stages import STAGES
+from velod.runtime.supervisor import Supervisor
+from velod.types import DepthBatch, FlowBatch, Message
+from velod.wire import encode
+from velod.wire.topics import BATCH_DEPTH, BATCH_FLOW, DEPTH, EVENTS, FLOW, IMU, IMU_SENSOR, key
+
+pytestmark = pytest.mark.system
+
+
+class Disturbance:
+    """Does something once, so long after the first velocity."""
+
+    def __init__(self, result_has_begun: list[float], after_s: float) -> None:
+        self.begun, self.after_s = result_has_begun, after_s
+        self.done = False
+
+    def is_due(self) -> bool:
+        due = not self.done and bool(self.begun) and time.monotonic() - self.begun[0] > self.after_s
+        self.done |= due
+        return due
+
+
+def longest_gap_s(result: OnlineResult) -> float:
+    """Between two valid velocities as they were published, from the first valid one on."""
+    t = np.array([p.t_pub_ns for p in result.velocities if p.velocity.valid])
+    return float(np.diff(t).max() * 1e-9)
+
+
+def kill_during_replay(
+    settings: Settings, recording: Path, worker: str
+) -> tuple[OnlineResult, dict[str, set[int]], list[str]]:
+    begun: list[float] = []
+    kill = Disturbance(begun, after_s=2.0)
+    seqs: dict[str, set[int]] = {"FlowBatch": set(), "DepthBatch": set()}
+
+    def on_message(message: Message) -> None:
+        if isinstance(message, FlowBatch | DepthBatch):
+            seqs[type(message).__name__].add(message.seq)
+
+    def on_step(supervisor: Supervisor) -> None:
+        if kill.is_due():
+            os.kill(supervisor.process_ids()[worker], signal.SIGKILL)
+
+    lines: list[str] = []
+    result = run_online(
+        settings,
+        open_recording(recording).calibration,
+        player_command(str(recording), settings.zenoh, settings.rig.name),
+        on_velocity=lambda _: None if begun else begun.append(time.monotonic()),
+        on_message=on_message,
+        topics=(FLOW, DEPTH),
+        on_step=on_step,
+        on_line=lines.append,
+    )
+    assert kill.done
+    return result, seqs, lines
+
+
+def lost(seqs: set[int]) -> int:
+    return max(seqs) + 1 - len(seqs)
+
+
+def assert_reported(result: OnlineResult, worker: str, log: pytest.LogCaptureFixture) -> None:
+    assert result.restarts[worker] == 1
+    assert sum(result.restarts.values()) == 1
+    supervisor = result.health["supervisor"]
+    assert supervisor.counters == {f"restarts.{worker}": 1}
+    assert "killed by SIGKILL" in supervisor.alarms[worker]
+    assert any(worker in r.getMessage() and "killed by SIGKILL" in r.getMessage() for r in log.records)
+
+
+@pytest.mark.parametrize("worker", ["flow-0", "depth-0"])
+def test_killing_a_flow_or_depth_worker_loses_no_batch_and_leaves_no_gap(
+    slanted: Path, settings: Settings, worker: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    result, seqs, _ = kill_during_replay(settings, slanted, worker)
+    assert_reported(result, worker, caplog)
+    assert lost(seqs["FlowBatch"]) == lost(seqs["DepthBatch"]) == 0
+    assert longest_gap_s(result) <= 0.1
+    assert result.gaps == 0
+
+
+@pytest.mark.parametrize("worker", ["ingest-0", "optimizer-0"])
+def test_after_the_death_of_ingest_or_the_optimizer_velocity_is_back_within_a_second(
+    slanted: Path, settings: Settings, worker: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    result, _, _ = kill_during_replay(settings, slanted, worker)
+    assert_reported(result, worker, caplog)
+    assert longest_gap_s(result) <= 1.0
+    last = [p.velocity for p in result.velocities][-50:]
+    assert all(v.valid for v in last)
+    assert np.median([np.linalg.norm(v.v_B - [-3.125, 0.0, 0.0]) for v in last]) < 0.1
+
+
+def test_garbage_and_alien_versions_are_counted_and_the_service_goes_on(slanted: Path, settings: Settings) -> None:
+    begun: list[float] = []
+    disturb = Disturbance(begun, after_s=1.0)
+    rig = settings.rig.name
+    flow = FlowBatch(
+        0, 1, 0, *(np.zeros(0, t) for t in (np.uint16, np.uint32, np.float32, np.float32)),
+        np.zeros((0, 2), np.float32), np.zeros(0, np.float32), np.zeros(0, np.float32),
+    )  # fmt: skip
+    alien = encode(flow, 0).replace(b"\xa1v\x01", b"\xa1v\x63")
+    assert b"\xa1v\x63" in alien
+    targets = [
+        key(EVENTS, rig, camera="left"),
+        key(IMU_SENSOR, rig),
+        key(BATCH_FLOW, rig, worker="flow-0"),
+        key(BATCH_DEPTH, rig, worker="depth-0"),
+        key(FLOW, rig),
+        key(IMU, rig),
+    ]
+
+    def on_step(supervisor: Supervisor) -> None:
+        if disturb.is_due():
+            for target in targets:
+                for data in (b"", b"\xff garbage", alien):
+                    supervisor.session.put(target, data)
+
+    result = run_online(
+        settings,
+        open_recording(slanted).calibration,
+        player_command(str(slanted), settings.zenoh, rig),
+        on_velocity=lambda _: None if begun else begun.append(time.monotonic()),
+        on_step=on_step,
+        on_line=logging.getLogger("workers").info,
+        spare=False,
+    )
+    assert disturb.done
+    refused = {
+        worker: sum(n for name, n in health.counters.items() if name.startswith("wire."))
+        for worker, health in result.health.items()
+    }
+    assert refused == {
+        "ingest-0": 6, "flow-0": 3, "depth-0": 3, "optimizer-0": 6, "player-0": 0, "supervisor": 0,
+    }  # fmt: skip
+    assert result.health["optimizer-0"].counters["wire.version_alien"] == 2
+    assert sum(result.restarts.values()) == 0
+    assert longest_gap_s(result) <= 0.1
+
+
+CONSUMER = """
+import sys, time
+from velod.config import ZenohSettings
+from velod.runtime.session import open_session
+with open_session(ZenohSettings(port=int(sys.argv[1]))) as session:
+    subscriber = session.declare_subscriber("velod/**")
+    time.sleep(0.5)
+    print("listening", flush=True)
+    time.sleep(600)
+"""
+
+
+def test_a_stopped_consumer_disturbs_nobody(slanted: Path, settings: Settings) -> None:
+    begun: list[float] = []
+    stop_it = Disturbance(begun, after_s=1.0)
+    consumers: list[subprocess.Popen[bytes]] = []
+
+    def on_step(supervisor: Supervisor) -> None:
+        if not consumers:
+            command = [sys.executable, "-c", CONSUMER, str(settings.zenoh.port)]
+            consumers.append(subprocess.Popen(command, stdout=subprocess.DEVNULL))
+        if stop_it.is_due():
+            os.kill(consumers[0].pid, signal.SIGSTOP)
+
+    try:
+        result = run_online(
+            settings,
+            open_recording(slanted).calibration,
+            player_command(str(slanted), settings.zenoh, settings.rig.name),
+            on_velocity=lambda _: None if begun else begun.append(time.monotonic()),
+            on_step=on_step,
+            on_line=logging.getLogger("workers").info,
+            spare=False,
+        )
+    finally:
+        for consumer in consumers:
+            consumer.kill()
+            consumer.wait()
+    assert stop_it.done
+    assert result.gaps == 0
+    assert longest_gap_s(result) <= 0.1
+
+
+SERVICE = """
+import logging, sys
+from velod.config import Settings, ZenohSettings
+from velod.runtime.supervisor import supervise
+from velod.runtime.warmup import plain_calibration
+logging.basicConfig(level=logging.INFO)
+supervise(Settings(zenoh=ZenohSettings(port=int(sys.argv[1]))), plain_calibration())
+"""
+
+
+def start_service(port: int) -> tuple[subprocess.Popen[str], set[int]]:
+    """The service as its own process, once all of its workers and the spare are there; and their process ids."""
+    service = subprocess.Popen(
+        [sys.executable, "-c", SERVICE, str(port)], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True
+    )
+    assert service.stderr is not None
+    up = 0
+    for line in service.stderr:
+        up += line.rstrip().endswith("INFO up")
+        if up == len(STAGES):
+            break
+    time.sleep(1.0)
+    return service, children_of(service.pid)
+
+
+def children_of(pid: int) -> set[int]:
+    text = Path(f"/proc/{pid}/task/{pid}/children").read_text()
+    return {int(child) for child in text.split()}
+
+
+def are_gone(pids: set[int], within_s: float) -> bool:
+    deadline_s = time.monotonic() + within_s
+    while time.monotonic() < deadline_s:
+        if not any(Path(f"/proc/{pid}").exists() for pid in pids):
+            return True
+        time.sleep(0.05)
+    return False
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGKILL])
+def test_a_supervisor_that_ends_leaves_no_process(port: int, number: signal.Signals) -> None:
+    service, children = start_service(port)
+    assert len(children) == len(STAGES) + 1
+    service.send_signal(number)
+    _, log = service.communicate(timeout=10.0)
+    assert are_gone(children, within_s=2.0)
+    assert service.returncode == (-signal.SIGKILL if number == signal.SIGKILL else 0)
+    assert "Traceback" not in log
+
+
+def test_a_port_in_use_gives_one_line_that_names_it(port: int) -> None:
+    settings = ZenohSettings(port=port)
+    with (
+        open_session(settings, introducer=True),
+        pytest.raises(SessionError, match=f"^port {port} is already in use") as caught,
+    ):
+        open_session(settings, introducer=True)
+    assert "\n" not in str(caught.value)
