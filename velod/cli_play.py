@@ -272,12 +272,12 @@ def demo(config: str | None, name: str, seconds: float, seed: int, csv: str | No
     print(summary(played, metrics), file=sys.stderr if json == "-" else sys.stdout)
     if json is not None:
         write_json(json, result_row(played, metrics))
-    if shortcomings := _shortcomings(played, metrics, settings_of(config).optimizer.output_hz):
-        raise RunFailed("; ".join(shortcomings))
+    if missing := shortcomings(played, metrics, settings_of(config).optimizer.output_hz):
+        raise RunFailed("; ".join(missing))
     return 0
 
 
-def _shortcomings(played: Played, metrics: Metrics, output_hz: float) -> list[str]:
+def shortcomings(played: Played, metrics: Metrics, output_hz: float) -> list[str]:
     """What a demo's result lacks; empty for a good one."""
     found = []
     if not metrics.ave_mps <= _DEMO_AVE_MPS:

@@ -1,0 +1,87 @@
+"""The command line with real processes: results, signals, and a port that is taken."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from velod.cli import main
+
+pytestmark = pytest.mark.system
+VELOD = [sys.executable, "-P", "-m", "velod.cli"]
+
+
+@pytest.fixture
+def settings_file(tmp_path: Path, port: int) -> Path:
+    path = tmp_path / "velod.toml"
+    path.write_text(f"[zenoh]\nport = {port}\n")
+    return path
+
+
+def children_of(pid: int) -> set[int]:
+    """Process ids of all children, alive now."""
+    tasks = Path(f"/proc/{pid}/task").glob("*/children")
+    return {int(child) for task in tasks for child in task.read_text().split()}
+
+
+def is_alive(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def test_eval_through_the_processes_knows_the_latency(slanted: Path, settings_file: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.json"
+    assert main(["eval", str(slanted), "-c", str(settings_file), "--speed", "max", "--json", str(out)]) == 0
+    result = json.loads(out.read_text())
+    assert result["ave_mps"] < 0.5 and result["valid_fraction"] > 0.9 and result["real_time_factor"] > 0.0
+    assert 0.0 < result["latency_p50_ms"] <= result["latency_p99_ms"]
+
+
+def test_a_port_that_is_taken_is_one_clear_line(slanted: Path, tmp_path: Path) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        settings = tmp_path / "velod.toml"
+        settings.write_text(f"[zenoh]\nport = {port}\n")
+        done = subprocess.run(
+            [*VELOD, "replay", str(slanted), "-c", str(settings)], capture_output=True, text=True, timeout=60
+        )
+    assert done.returncode == 2
+    assert done.stderr.splitlines()[-1].startswith(f"velod: error: port {port} is already in use")
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="looks for child processes in /proc")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_a_replay_and_all_its_processes(
+    number: signal.Signals, slanted: Path, settings_file: Path
+) -> None:
+    with subprocess.Popen(
+        [*VELOD, "replay", str(slanted), "-c", str(settings_file), "--speed", "0.05"],
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        try:
+            deadline_s = time.monotonic() + 60.0
+            # Four workers, the spare and the driver.
+            while len(seen := children_of(process.pid)) < 6 and time.monotonic() < deadline_s:
+                time.sleep(0.05)
+            assert len(seen) >= 6
+            os.kill(process.pid, number)
+            _, errors = process.communicate(timeout=20)
+        finally:
+            process.kill()
+    assert process.returncode == 130
+    assert errors.splitlines()[-1] == "velod: interrupted" and "Traceback" not in errors
+    assert not any(is_alive(pid) for pid in seen)

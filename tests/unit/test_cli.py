@@ -1,0 +1,268 @@
+"""What people type: results in the documented form, and one clear line for everything that is wrong."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from tests import slanted_scene
+from velod import config
+from velod.cli import main
+from velod.config import Settings
+from velod.eval.metrics import truth_at
+from velod.geometry.calibration import load_calibration, save_calibration
+from velod.io import open_recording
+
+COMMANDS = ("demo", "run", "replay", "eval", "sim", "echo", "top", "config", "warmup")
+EVAL_KEYS = [
+    *("ave_mps", "rve_percent", "p95_mps", "n", "first_valid_s", "valid_fraction", "ave_floor_mps", "nees_mean"),
+    *("real_time_factor", "latency_p50_ms", "latency_p99_ms"),
+]
+CSV_HEADER = "t_ns,vx,vy,vz,cov_xx,cov_xy,cov_xz,cov_yy,cov_yz,cov_zz,state,valid,age_ms"
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return slanted_scene.write(tmp_path_factory.mktemp("cli") / "slanted.h5", 0.6)
+
+
+def error_of(capsys: pytest.CaptureFixture[str], *argv: str) -> str:
+    """The one line that a command which must fail with 2 writes to stderr."""
+    assert main(argv) == 2
+    captured = capsys.readouterr()
+    lines = captured.err.splitlines()
+    assert captured.out == "" and len(lines) == 1 and lines[0].startswith("velod: error: ")
+    return lines[0].removeprefix("velod: error: ")
+
+
+def refused_by_parser(capsys: pytest.CaptureFixture[str], *argv: str) -> str:
+    with pytest.raises(SystemExit) as caught:
+        main(argv)
+    assert caught.value.code == 2
+    return capsys.readouterr().err
+
+
+# --- help ---
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_teaches_with_examples_of_itself(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main([command, "--help"])
+    text = capsys.readouterr().out
+    assert caught.value.code == 0
+    assert f"velod {command}" in text.split("examples:\n")[1]
+
+
+def test_help_is_at_hand_without_loading_anything_heavy() -> None:
+    code = (
+        "import sys; from velod.cli import main\n"
+        "try: main(['--help'])\n"
+        "except SystemExit: pass\n"
+        "print([m for m in ('numpy', 'numba', 'zenoh', 'scipy', 'cv2') if m in sys.modules], file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stderr.strip() == "[]"
+    assert all(f"    {command} " in done.stdout for command in COMMANDS)
+
+
+# --- what is wrong ---
+
+
+def test_a_missing_settings_file_is_named(capsys: pytest.CaptureFixture[str], recording: Path) -> None:
+    assert error_of(capsys, "run", "-c", "nowhere.toml") == "nowhere.toml: no such file"
+    assert error_of(capsys, "replay", str(recording), "-c", "nowhere.toml") == "nowhere.toml: no such file"
+
+
+def test_a_wrong_setting_is_named_with_file_key_and_reason(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    path = tmp_path / "velod.toml"
+    path.write_text("[flow]\nworkers = 0\n")
+    for argv in (["config", "check", str(path)], ["run", "-c", str(path)], ["demo", "-c", str(path)]):
+        assert error_of(capsys, *argv) == f"{path}: flow.workers: must be at least 1, got 0"
+
+
+def test_a_missing_recording_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    assert error_of(capsys, "eval", "nowhere.h5", "--offline") == "nowhere.h5: no such file or directory"
+
+
+def test_a_truncated_recording_is_named(capsys: pytest.CaptureFixture[str], tmp_path: Path, recording: Path) -> None:
+    path = tmp_path / "cut.h5"
+    path.write_bytes(recording.read_bytes()[:5000])
+    assert "cut.h5" in error_of(capsys, "replay", str(path))
+
+
+def test_a_recording_without_truth_cannot_be_judged(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, recording: Path
+) -> None:
+    path = tmp_path / "no_truth.h5"
+    path.write_bytes(recording.read_bytes())
+    with h5py.File(path, "a") as f:
+        del f["gt"]
+    assert "holds no truth" in error_of(capsys, "eval", str(path), "--offline")
+
+
+def test_a_calibration_that_cannot_be_read_is_named(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    path = tmp_path / "rig.yaml"
+    path.write_text("left: {width: 346}\n")
+    assert error_of(capsys, "config", "calibration", str(path)).startswith(f"{path}: ")
+    settings = tmp_path / "velod.toml"
+    settings.write_text(f'[rig]\ncalibration = "{path}"\n')
+    assert error_of(capsys, "run", "-c", str(settings)).startswith(f"{path}: ")
+
+
+def test_the_service_beside_a_sensor_needs_a_calibration(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "rig.calibration: missing" in error_of(capsys, "run")
+
+
+def test_a_malformed_endpoint_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "zenoh.connect" in error_of(capsys, "echo", "--connect", "rig:17447")
+
+
+@pytest.mark.parametrize(
+    ("argv", "cause"),
+    [
+        (["echo", "speed"], "no topic 'speed' to print; topics: events, "),
+        (["echo", "alive"], "no topic 'alive' to print"),
+        (["sim", "corridor-9", "-o", "x.h5"], "unknown sequence 'corridor-9'"),
+        (["demo", "--sequence", "corridor-9"], "unknown sequence 'corridor-9'"),
+    ],
+)
+def test_an_unknown_name_is_answered_with_the_known_ones(
+    argv: list[str], cause: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(argv) == 2
+    assert cause in capsys.readouterr().err
+
+
+def test_a_malformed_packet_rate_is_named(capsys: pytest.CaptureFixture[str], recording: Path) -> None:
+    assert "got 'often'" in error_of(capsys, "replay", str(recording), "--packets", "often")
+
+
+@pytest.mark.parametrize(
+    ("argv", "cause"),
+    [
+        (["replay", "x.h5", "--speed", "fast"], "not a number: 'fast'"),
+        (["replay", "x.h5", "--speed", "-1"], "must be positive"),
+        (["demo", "--seconds", "nan"], "must be positive"),
+        (["run", "--only", "flow,stereo"], "no stage 'stereo'"),
+        ([], "COMMAND"),
+    ],
+)
+def test_a_value_that_cannot_be_is_refused_at_once(
+    argv: list[str], cause: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cause in refused_by_parser(capsys, *argv)
+
+
+def test_a_result_that_cannot_be_written_is_named(capsys: pytest.CaptureFixture[str], recording: Path) -> None:
+    assert main(["replay", str(recording), "--offline", "--csv", "nowhere/out.csv"]) == 2
+    assert capsys.readouterr().err == "velod: error: nowhere/out.csv: No such file or directory\n"
+
+
+def test_a_run_without_a_valid_velocity_fails_and_says_so(
+    capsys: pytest.CaptureFixture[str], recording: Path, tmp_path: Path
+) -> None:
+    settings = tmp_path / "velod.toml"
+    settings.write_text("[optimizer]\nmin_flows = 10000\n")
+    out = tmp_path / "out.json"
+    argv = ["eval", str(recording), "--offline", "-c", str(settings), "--json", str(out)]
+    assert main(argv) == 1
+    assert capsys.readouterr().err == f"velod: failed: {recording}: no valid velocity\n"
+    assert json.loads(out.read_text())["ave_mps"] is None
+
+
+# --- what comes out ---
+
+
+def test_replay_writes_every_velocity_as_csv(
+    capsys: pytest.CaptureFixture[str], recording: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out.csv"
+    assert main(["replay", str(recording), "--offline", "--csv", str(out)]) == 0
+    text = out.read_text()
+    assert text.splitlines()[0] == CSV_HEADER
+    rows = list(csv.DictReader(text.splitlines()))
+    valid = [row for row in rows if row["valid"] == "1"]
+    assert len(rows) >= len(valid) > 20
+    truth = open_recording(recording).truth
+    assert truth is not None
+    v = np.array([[float(row[c]) for c in ("vx", "vy", "vz")] for row in valid])
+    t_ns = np.array([int(row["t_ns"]) for row in valid])
+    inside = t_ns <= truth.t_ns[-1]
+    assert np.abs(v[inside] - truth_at(truth, t_ns[inside])).mean() < 0.3
+    assert {row["state"] for row in valid} <= {"tracking", "degraded"}
+    assert all(0.0 <= float(row["age_ms"]) < 100.0 for row in valid)
+    assert all(float(row["cov_xx"]) > 0.0 for row in valid)
+    shown = capsys.readouterr().out
+    assert re.search(r"AVE +0\.\d{4} m/s", shown) and "75.00 Hz" in shown
+
+
+def test_eval_writes_the_documented_keys_and_nulls_what_offline_cannot_know(
+    capsys: pytest.CaptureFixture[str], recording: Path
+) -> None:
+    assert main(["eval", str(recording), "--offline", "--json", "-"]) == 0
+    captured = capsys.readouterr()
+    result = json.loads(captured.out)
+    assert list(result) == EVAL_KEYS
+    assert result["ave_mps"] < 0.5 and result["n"] > 20 and result["real_time_factor"] > 0.0
+    assert result["latency_p50_ms"] is None and result["latency_p99_ms"] is None and result["ave_floor_mps"] is None
+    assert "AVE" in captured.err
+
+
+def test_eval_of_several_files_is_a_list_and_pictures_are_drawn(recording: Path, tmp_path: Path) -> None:
+    out, pictures = tmp_path / "out.json", tmp_path / "pictures"
+    argv = ["eval", str(recording), str(recording), "--offline", "--json", str(out), "--plot", str(pictures)]
+    assert main(argv) == 0
+    first, second = json.loads(out.read_text())
+    assert {**first, "real_time_factor": 0} == {**second, "real_time_factor": 0}
+    assert {p.name for p in pictures.iterdir()} == {"slanted_velocity.png", "slanted_error.png"}
+
+
+def test_simulated_files_are_recordings(tmp_path: Path) -> None:
+    path = tmp_path / "sim.h5"
+    assert main(["sim", "boxes-4", "-o", str(path), "--seconds", "0.05", "--seed", "3"]) == 0
+    assert open_recording(path).truth is not None
+
+
+# --- settings ---
+
+
+def test_written_settings_are_the_defaults_and_are_not_overwritten(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    path = tmp_path / "velod.toml"
+    assert main(["config", "init", str(path)]) == 0
+    assert main(["config", "check", str(path)]) == 0
+    assert config.load(path) == Settings()
+    capsys.readouterr()
+    assert "exists already" in error_of(capsys, "config", "init", str(path))
+    path.write_text("[flow]\nworkers = 2\n")
+    assert main(["config", "init", "--force", str(path)]) == 0
+    assert config.load(path) == Settings()
+
+
+def test_the_settings_in_effect_are_shown(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    path = tmp_path / "velod.toml"
+    path.write_text("[flow]\nworkers = 2\n")
+    assert main(["config", "show", "-c", str(path)]) == 0
+    shown = tomllib.loads(capsys.readouterr().out)
+    assert shown["flow"]["workers"] == 2 and shown["depth"]["workers"] == 1
+
+
+def test_a_calibration_is_shown_as_velods_own(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    path, shown = tmp_path / "rig.yaml", tmp_path / "shown.yaml"
+    save_calibration(path, slanted_scene.RIG)
+    assert main(["config", "calibration", str(path)]) == 0
+    shown.write_text(capsys.readouterr().out)
+    assert load_calibration(shown).left == slanted_scene.CAMERA
