@@ -92,7 +92,7 @@ def select_paper(
     none_taken = np.full(last.shape, NEVER, np.int64)
     chosen = _choose(
         last, mask, t_end_ns, memory_ns, border_px, quota, seq,
-        False, time_share * memory_ns, 0, PAPER_MIN_NEIGHBOURS, 0.0, none_taken,
+        False, time_share * memory_ns * 1e-9, 0, PAPER_MIN_NEIGHBOURS, math.inf, none_taken,
     )  # fmt: skip
     return _columns(chosen, last)
 
@@ -119,7 +119,10 @@ def _choose(
     max_rms_px: float,
     taken: I64,
 ) -> I32:
-    """Flat indices into ``surface`` of at most ``quota`` events out of those marked."""
+    """Flat indices into ``surface`` of at most ``quota`` events out of those marked.
+
+    ``tolerance`` is that of the rule: ``reject_px`` for bursts, seconds about the neighbours' mean for the paper's.
+    """
     _, h, w = surface.shape
     # About as many cells as events wanted.
     cell_px = max(1, round(math.sqrt(h * w / quota)))
@@ -241,19 +244,17 @@ def _take_in_turn(
                 k, r, c = flat // (h * w), flat // w % h, flat % w
                 _ages(surface[k], r, c, t_end_ns, memory_ns, age)
                 if burst:
-                    rms = _burst_rms_px(age, tolerance, rejections, min_neighbours)
-                    if not rms < max_rms_px:
-                        continue
-                    if rms >= GOOD * max_rms_px:
-                        if n_reserve < reserve.size:
-                            reserve[n_reserve] = flat
-                            n_reserve += 1
-                        break
-                elif not _obeys_paper(age, min_neighbours, tolerance * 1e-9):
+                    rms_px = _plane_rms_px(age, tolerance, rejections, min_neighbours)
+                else:
+                    rms_px = 0.0 if _obeys_paper(age, min_neighbours, tolerance) else math.inf
+                if not rms_px < max_rms_px:
                     continue
-                if n < chosen.size:
+                if rms_px < GOOD * max_rms_px and n < chosen.size:
                     chosen[n] = flat
                     n += 1
+                elif n_reserve < reserve.size:
+                    reserve[n_reserve] = flat
+                    n_reserve += 1
                 break
             if top[cell] > cell_end[cell]:
                 cells[still_open] = cell
@@ -289,13 +290,8 @@ def _ages(surface: I64, r: int, c: int, t_end_ns: int, memory_ns: int, age: F64)
 
 
 @njit(cache=True, nogil=True)
-def _burst_rms_px(age: F64, reject_px: float, rejections: int, min_neighbours: int) -> float:
-    """How well one plane explains the neighbourhood on both sides of the event, px; inf where none does."""
-    n = 0
-    for j in range(SIZE):
-        n += age[j] > 0.0
-    if n < min_neighbours:
-        return math.inf
+def _plane_rms_px(age: F64, reject_px: float, rejections: int, min_neighbours: int) -> float:
+    """How well one plane explains the neighbourhood, px; inf where none does."""
     left, gx, gy, _, rms, _, _, _ = fit_plane(age, reject_px, rejections, min_neighbours)
     slope = math.hypot(gx, gy)
     return rms / slope if left > 0 and slope > 0.0 else math.inf
