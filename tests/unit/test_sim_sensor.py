@@ -107,7 +107,15 @@ def test_a_sample_interpolates_between_the_four_texels_around_it(texture: Textur
         expected = (1 - q) * ((1 - p) * corner[0][0] + p * corner[0][1]) + q * (
             (1 - p) * corner[1][0] + p * corner[1][1]
         )
-        got = sample(texture.texels, texture.offset, np.float32(u), np.float32(v), level, np.float32(0.0))
+        got = sample(
+            texture.texels,
+            np.uint32(texture.offset[level]),
+            np.uint32(size),
+            np.float32(0.5**level),
+            np.float32(u),
+            np.float32(v),
+            np.float32(0.0),
+        )
         assert got == pytest.approx(expected, abs=2e-3)
 
 

@@ -11,11 +11,8 @@ from numba import njit
 
 from velod.geometry.calibration import Camera
 from velod.sim.scene import Scene
-from velod.sim.texture import TEXEL_M, Texture, sample
+from velod.sim.texture import COARSEST, SIZE, TEXEL_M, Texture, sample
 from velod.types import F32, F64, I64
-
-_MAX_TAPS = 4
-_COARSEST = 8
 
 
 class Renderer:
@@ -29,6 +26,7 @@ class Renderer:
         self._pinhole = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
         self._scene, self._texture = scene, texture
         self._surfaces = scene.surfaces.astype(np.float32)
+        self._work: F32 = np.empty((5, camera.width), np.float32)
 
     def render(self, R_WC: F64, p_WC: F64, areas: I64) -> None:
         """Bring ``areas`` up to date for a camera at ``p_WC`` (m, in W) with axes ``R_WC``."""
@@ -40,7 +38,14 @@ class Renderer:
             _cast_boxes(scene.boxes, *pose, areas, self.depth, self._surface)
         texture = self._texture
         _shade(
-            self._surfaces, texture.texels, texture.offset, *pose, areas, self.depth, self._surface, self.intensity
+            self._surfaces,
+            texture.texels,
+            *pose,
+            areas,
+            self.depth,
+            self._surface,
+            self.intensity,
+            self._work,
         )
 
 
@@ -174,12 +179,16 @@ def _box_bounds(box: F64, pinhole: F64, R_WC: F64, p: F64, width: int, height: i
     return i0, i1, j0, j1
 
 
-# Single precision throughout: half the time of double, and 1e-4 px on the image.
-@njit(cache=True, nogil=True, fastmath=True)
+# Rows of the work array: place on the texture (texels), half the way between its two samples, footprint squared.
+_U, _V, _HALF_U, _HALF_V, _FOOTPRINT2 = range(5)
+
+
+# Single precision throughout, and in runs of pixels that see one surface, so that LLVM vectorises what it can: half
+# the time of the obvious loop, at 1e-4 px on the image.
+@njit(cache=True, nogil=True)
 def _shade(
     surfaces: F32,
     texels: F32,
-    offset: I64,
     pinhole: F64,
     R_WC: F64,
     p: F64,
@@ -187,90 +196,126 @@ def _shade(
     depth: F32,
     surface: I64,
     intensity: F32,
+    work: F32,
 ) -> None:
     """Intensity of every pixel: the texture at the point hit, filtered over the pixel's footprint there."""
-    f32 = np.float32
-    fx, fy, cx, cy = f32(pinhole[0]), f32(pinhole[1]), f32(pinhole[2]), f32(pinhole[3])
-    r00, r01, r02 = f32(R_WC[0, 0]), f32(R_WC[0, 1]), f32(R_WC[0, 2])
-    r10, r11, r12 = f32(R_WC[1, 0]), f32(R_WC[1, 1]), f32(R_WC[1, 2])
-    r20, r21, r22 = f32(R_WC[2, 0]), f32(R_WC[2, 1]), f32(R_WC[2, 2])
-    p0, p1, p2 = f32(p[0]), f32(p[1]), f32(p[2])
-    per_m = f32(1.0 / TEXEL_M)
+    # The camera's axes and place, f, and what is left of the principal point: all that a row needs.
+    view = np.empty(16, np.float32)
+    for k in range(3):
+        view[k], view[3 + k], view[6 + k], view[9 + k] = R_WC[k, 0], R_WC[k, 1], R_WC[k, 2], p[k]
+    fx, fy, cx, cy = pinhole
+    view[12], view[13] = 1.0 / fx, 1.0 / fy
     for m in range(areas.shape[0]):
+        first, end = areas[m, 2], areas[m, 3]
         for j in range(areas[m, 0], areas[m, 1]):
-            yn = (f32(j) - cy) / fy
-            for i in range(areas[m, 2], areas[m, 3]):
-                xn = (f32(i) - cx) / fx
-                dx, dy, dz = r00 * xn + r01 * yn + r02, r10 * xn + r11 * yn + r12, r20 * xn + r21 * yn + r22
-                z = depth[j, i]
-                px, py, pz = p0 + z * dx, p1 + z * dy, p2 + z * dz
-                k = surface[j, i]
-                radius = surfaces[k, 11]
-                if radius > f32(0.0):
-                    r = f32(1.0) / np.sqrt(px * px + py * py)
-                    nx, ny, nz = px * r, py * r, f32(0.0)
-                    ux, uy, uz = -ny, nx, f32(0.0)
-                    vx, vy, vz = f32(0.0), f32(0.0), f32(1.0)
-                    u, v = radius * _atan2(py, px), pz
+            view[15] = (j - cy) / fy
+            start = first
+            while start < end:
+                k, stop = surface[j, start], start + 1
+                while stop < end and surface[j, stop] == k:
+                    stop += 1
+                view[14] = (start - cx) / fx
+                if surfaces[k, 11] > 0.0:
+                    _locate_on_cylinder(surfaces[k], view, depth[j, start:stop], start - first, work)
                 else:
-                    nx, ny, nz = surfaces[k, 0], surfaces[k, 1], surfaces[k, 2]
-                    ux, uy, uz = surfaces[k, 3], surfaces[k, 4], surfaces[k, 5]
-                    vx, vy, vz = surfaces[k, 6], surfaces[k, 7], surfaces[k, 8]
-                    u, v = ux * px + uy * py + uz * pz, vx * px + vy * py + vz * pz
-                # One pixel along the camera's axis e moves the point hit by z/f (e - d (n.e)/(n.d)).
-                nd = f32(1.0) / (nx * dx + ny * dy + nz * dz)
-                ud, vd = (ux * dx + uy * dy + uz * dz) * nd, (vx * dx + vy * dy + vz * dz) * nd
-                n_x, n_y = nx * r00 + ny * r10 + nz * r20, nx * r01 + ny * r11 + nz * r21
-                gx, gy = z * per_m / fx, z * per_m / fy
-                u_x, v_x = (
-                    gx * (ux * r00 + uy * r10 + uz * r20 - ud * n_x),
-                    gx * (vx * r00 + vy * r10 + vz * r20 - vd * n_x),
-                )
-                u_y, v_y = (
-                    gy * (ux * r01 + uy * r11 + uz * r21 - ud * n_y),
-                    gy * (vx * r01 + vy * r11 + vz * r21 - vd * n_y),
-                )
-                u, v = (u + surfaces[k, 9]) * per_m, (v + surfaces[k, 10]) * per_m
-                intensity[j, i] = _filtered(texels, offset, u, v, u_x, v_x, u_y, v_y)
+                    _locate_on_plane(surfaces[k], view, depth[j, start:stop], start - first, work)
+                start = stop
+            _sample_row(texels, work, intensity[j, first:end])
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _filtered(
-    texels: F32,
-    offset: I64,
-    u: np.float32,
-    v: np.float32,
-    u_x: np.float32,
-    v_x: np.float32,
-    u_y: np.float32,
-    v_y: np.float32,
-) -> np.float32:
-    """Mean of up to _MAX_TAPS samples along the longer side of the footprint, each filtered over its share of it."""
-    f32 = np.float32
-    length2, along_u, along_v = u_x * u_x + v_x * v_x, u_x, v_x
-    other2 = u_y * u_y + v_y * v_y
-    if other2 > length2:
-        length2, along_u, along_v = other2, u_y, v_y
+def _locate_on_plane(surface: F32, view: F32, depth: F32, at: int, work: F32) -> None:
+    """Fill columns ``at`` onwards of ``work`` for a run of pixels that see one plane."""
+    r00, r10, r20 = view[0], view[1], view[2]
+    r01, r11, r21 = view[3], view[4], view[5]
+    r02, r12, r22 = view[6], view[7], view[8]
+    p0, p1, p2 = view[9], view[10], view[11]
+    per_fx, per_fy, x0, yn = view[12], view[13], view[14], view[15]
+    nx, ny, nz = surface[0], surface[1], surface[2]
+    ux, uy, uz = surface[3], surface[4], surface[5]
+    vx, vy, vz = surface[6], surface[7], surface[8]
+    u0, v0 = surface[9], surface[10]
+    per_m = np.float32(1.0 / TEXEL_M)
+    for i in range(depth.shape[0]):
+        xn = x0 + np.float32(i) * per_fx
+        dx, dy, dz = r00 * xn + r01 * yn + r02, r10 * xn + r11 * yn + r12, r20 * xn + r21 * yn + r22
+        z = depth[i]
+        px, py, pz = p0 + z * dx, p1 + z * dy, p2 + z * dz
+        # One pixel along the camera's axis e moves the point hit by z/f (e - d (n.e)/(n.d)).
+        nd = np.float32(1.0) / (nx * dx + ny * dy + nz * dz)
+        ud, vd = (ux * dx + uy * dy + uz * dz) * nd, (vx * dx + vy * dy + vz * dz) * nd
+        n_x, n_y = nx * r00 + ny * r10 + nz * r20, nx * r01 + ny * r11 + nz * r21
+        gx, gy = z * per_m * per_fx, z * per_m * per_fy
+        u_x, v_x = gx * (ux * r00 + uy * r10 + uz * r20 - ud * n_x), gx * (vx * r00 + vy * r10 + vz * r20 - vd * n_x)
+        u_y, v_y = gy * (ux * r01 + uy * r11 + uz * r21 - ud * n_y), gy * (vx * r01 + vy * r11 + vz * r21 - vd * n_y)
+        work[_U, at + i], work[_V, at + i] = (
+            (ux * px + uy * py + uz * pz + u0) * per_m,
+            (vx * px + vy * py + vz * pz + v0) * per_m,
+        )
+        work[_HALF_U, at + i], work[_HALF_V, at + i], work[_FOOTPRINT2, at + i] = _taps(u_x, v_x, u_y, v_y)
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _locate_on_cylinder(surface: F32, view: F32, depth: F32, at: int, work: F32) -> None:
+    """As ``_locate_on_plane``, for an upright cylinder about W's z axis."""
+    r00, r10, r20 = view[0], view[1], view[2]
+    r01, r11, r21 = view[3], view[4], view[5]
+    r02, r12, r22 = view[6], view[7], view[8]
+    p0, p1, p2 = view[9], view[10], view[11]
+    per_fx, per_fy, x0, yn = view[12], view[13], view[14], view[15]
+    u0, v0, radius = surface[9], surface[10], surface[11]
+    per_m = np.float32(1.0 / TEXEL_M)
+    for i in range(depth.shape[0]):
+        xn = x0 + np.float32(i) * per_fx
+        dx, dy, dz = r00 * xn + r01 * yn + r02, r10 * xn + r11 * yn + r12, r20 * xn + r21 * yn + r22
+        z = depth[i]
+        px, py, pz = p0 + z * dx, p1 + z * dy, p2 + z * dz
+        r = np.float32(1.0) / np.sqrt(px * px + py * py)
+        # n = (nx, ny, 0), e_u = (-ny, nx, 0), e_v = (0, 0, 1)
+        nx, ny = px * r, py * r
+        nd = np.float32(1.0) / (nx * dx + ny * dy)
+        ud, vd = (nx * dy - ny * dx) * nd, dz * nd
+        n_x, n_y = nx * r00 + ny * r10, nx * r01 + ny * r11
+        gx, gy = z * per_m * per_fx, z * per_m * per_fy
+        u_x, v_x = gx * (nx * r10 - ny * r00 - ud * n_x), gx * (r20 - vd * n_x)
+        u_y, v_y = gy * (nx * r11 - ny * r01 - ud * n_y), gy * (r21 - vd * n_y)
+        work[_U, at + i], work[_V, at + i] = (radius * _atan2(py, px) + u0) * per_m, (pz + v0) * per_m
+        work[_HALF_U, at + i], work[_HALF_V, at + i], work[_FOOTPRINT2, at + i] = _taps(u_x, v_x, u_y, v_y)
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _taps(
+    u_x: np.float32, v_x: np.float32, u_y: np.float32, v_y: np.float32
+) -> tuple[np.float32, np.float32, np.float32]:
+    """Two samples along the longer side of a footprint: half their distance, and the extent squared of each."""
+    quarter = np.float32(0.25)
+    x2, y2 = u_x * u_x + v_x * v_x, u_y * u_y + v_y * v_y
+    long2 = max(x2, y2)
+    half_u, half_v = quarter * (u_y if y2 > x2 else u_x), quarter * (v_y if y2 > x2 else v_x)
     # Area over length is the extent across, also where the two sides are far from orthogonal.
-    area = abs(u_x * v_y - u_y * v_x)
-    taps = 1
-    while taps < _MAX_TAPS and length2 > f32(1.5) * f32(taps) * area and length2 > f32(taps * taps):
-        taps += 1
-    footprint2 = length2 / f32(taps * taps)
-    level = 0
-    while footprint2 > f32(4.0) and level < _COARSEST:
-        footprint2 *= f32(0.25)
-        level += 1
-    share = f32(0.0)
-    if footprint2 > f32(1.0):
+    area = u_x * v_y - u_y * v_x
+    return half_u, half_v, max(quarter * long2, area * area / long2)
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _sample_row(texels: F32, work: F32, intensity: F32) -> None:
+    """The mean of each pixel's two samples, between the two levels of the pyramid around its footprint."""
+    one, half, coarsest = np.float32(1.0), np.float32(0.5), np.uint32(2 * SIZE >> COARSEST)
+    for i in range(intensity.shape[0]):
+        footprint2 = work[_FOOTPRINT2, i]
+        # The level whose texels are the next smaller to the footprint.
+        start, size, scale = np.uint32(0), np.uint32(SIZE), one
+        while footprint2 > np.float32(4.0) * scale * scale and size > coarsest:
+            start += size * size
+            size >>= np.uint32(1)
+            scale *= np.float32(2.0)
         # log2 of the footprint between 1 and 2 texels, to 1 %.
-        e = np.sqrt(footprint2) - f32(1.0)
-        share = min(e * (f32(1.34) - f32(0.34) * e), f32(1.0))
-    total = f32(0.0)
-    for k in range(taps):
-        at = (f32(k) + f32(0.5)) / f32(taps) - f32(0.5)
-        total += sample(texels, offset, u + at * along_u, v + at * along_v, level, share)
-    return total / f32(taps)
+        e = np.sqrt(max(footprint2 / (scale * scale), one)) - one
+        share = min(e * (np.float32(1.34) - np.float32(0.34) * e), one)
+        u, v, half_u, half_v = work[_U, i], work[_V, i], work[_HALF_U, i], work[_HALF_V, i]
+        first = sample(texels, start, size, one / scale, u - half_u, v - half_v, share)
+        second = sample(texels, start, size, one / scale, u + half_u, v + half_v, share)
+        intensity[i] = half * (first + second)
 
 
 @njit(cache=True, nogil=True, fastmath=True)
@@ -284,8 +329,6 @@ def _atan2(y: np.float32, x: np.float32) -> np.float32:
     a = f32(0.0964200441) + s * (f32(-0.0559098861) + s * a)
     a = f32(0.1994653599) + s * (f32(-0.1390853351) + s * a)
     a = q * (f32(0.9999993329) + s * (f32(-0.3332985605) + s * a))
-    if ay > ax:
-        a = f32(0.5 * np.pi) - a
-    if x < f32(0.0):
-        a = f32(np.pi) - a
+    a = f32(0.5 * np.pi) - a if ay > ax else a
+    a = f32(np.pi) - a if x < f32(0.0) else a
     return -a if y < f32(0.0) else a

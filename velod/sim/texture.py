@@ -19,6 +19,9 @@ SIZE = 2048
 TEXEL_M = 0.004
 """Side of a texel of the finest level on every surface, m. The texture repeats every SIZE * TEXEL_M = 8.2 m."""
 
+COARSEST = 8
+"""The last level of the pyramid: texels of 1 m."""
+
 
 @dataclass(frozen=True, slots=True)
 class Texture:
@@ -89,7 +92,7 @@ def _binomial(image: F32) -> F32:
 
 def _pyramid(level: F32) -> Texture:
     levels = [level]
-    while len(level) > 1:
+    for _ in range(COARSEST):
         level = level.reshape(len(level) // 2, 2, len(level) // 2, 2).mean(axis=(1, 3), dtype=np.float32)
         levels.append(level)
     offset = np.cumsum([0] + [part.size for part in levels[:-1]], dtype=np.int64)
@@ -97,28 +100,37 @@ def _pyramid(level: F32) -> Texture:
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def sample(texels: F32, offset: I64, u: np.float32, v: np.float32, level: int, share: np.float32) -> np.float32:
-    """Intensity at (u, v), in texels of the finest level, between ``level`` and the next coarser one (trilinear)."""
-    fine: np.float32 = _bilinear(texels, offset[level], u, v, level)
-    coarse: np.float32 = _bilinear(texels, offset[level + 1], u, v, level + 1)
+def sample(
+    texels: F32,
+    start: np.uint32,
+    size: np.uint32,
+    per_texel: np.float32,
+    u: np.float32,
+    v: np.float32,
+    share: np.float32,
+) -> np.float32:
+    """Intensity at (u, v), in texels of the finest level, ``share`` of the way from a level to the next coarser one.
+
+    ``start``: where the level begins in ``texels``; ``size``: its side; ``per_texel``: size / SIZE.
+    """
+    half, coarser = np.float32(0.5), size >> np.uint32(1)
+    fine: np.float32 = _bilinear(texels, start, size, u * per_texel - half, v * per_texel - half)
+    x, y = u * per_texel * half - half, v * per_texel * half - half
+    coarse: np.float32 = _bilinear(texels, start + size * size, coarser, x, y)
     blend: np.float32 = fine + share * (coarse - fine)
     return blend
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _bilinear(texels: F32, start: int, u: np.float32, v: np.float32, level: int) -> np.float32:
-    size = SIZE >> level
-    half = np.float32(0.5)
-    scale = np.float32(1.0) / np.float32(1 << level)
-    # The centre of texel i of a level lies at (i + 0.5) * 2^level.
-    x, y = u * scale - half, v * scale - half
+def _bilinear(texels: F32, start: np.uint32, size: np.uint32, x: np.float32, y: np.float32) -> np.float32:
+    """Between the four texels of a level around (x, y); the centre of texel i lies at i."""
     x0, y0 = np.floor(x), np.floor(y)
     p, q = x - x0, y - y0
-    mask = size - 1
-    i, j = int(x0) & mask, int(y0) & mask
-    i1, j1 = (i + 1) & mask, (j + 1) & mask
-    row0, row1 = start + j * size, start + j1 * size
-    top = texels[row0 + i] + p * (texels[row0 + i1] - texels[row0 + i])
+    # Unsigned, so that numba does not ask for indices from the end; & wraps around.
+    one, mask = np.uint32(1), size - np.uint32(1)
+    i, j = np.uint32(np.int32(x0)) & mask, np.uint32(np.int32(y0)) & mask
+    i1, row, row1 = (i + one) & mask, start + j * size, start + ((j + one) & mask) * size
+    top = texels[row + i] + p * (texels[row + i1] - texels[row + i])
     bottom = texels[row1 + i] + p * (texels[row1 + i1] - texels[row1 + i])
     blend: np.float32 = top + q * (bottom - top)
     return blend
