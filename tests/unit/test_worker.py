@@ -1,0 +1,111 @@
+"""Names, command lines and restarts of workers."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from dataclasses import replace
+
+import pytest
+
+from velod.config import FlowSettings, Settings, ZenohSettings
+from velod.runtime import worker
+from velod.runtime.process import ChildProcess, stop_all
+from velod.runtime.stages import create_stage, stage_of, worker_names
+from velod.runtime.supervisor import Supervisor, restart_delay_s
+from velod.runtime.warmup import ensure_cache_directory, plain_calibration
+
+
+def test_a_name_tells_the_stage() -> None:
+    assert stage_of("flow-12") == "flow"
+    for wrong in ("flow", "flow-", "flow-x", "camera-0", ""):
+        with pytest.raises(ValueError, match="must be <stage>-<number>"):
+            stage_of(wrong)
+
+
+def test_settings_say_how_many_workers_there_are() -> None:
+    settings = Settings(flow=FlowSettings(workers=2))
+    assert worker_names(settings, "flow") == ["flow-0", "flow-1"]
+    assert worker_names(settings, "ingest") == ["ingest-0"]
+
+
+def test_a_stage_that_is_none_is_refused() -> None:
+    with pytest.raises(ValueError, match="no stage 'camera'"):
+        create_stage("camera", Settings(), plain_calibration())
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        ZenohSettings(port=1234),
+        ZenohSettings(connect="tcp/far:1", listen="tcp/10.0.0.1:2", shared_memory=False, lossless=True),
+        ZenohSettings(config="zenoh.json5"),
+    ],
+)
+def test_a_worker_s_session_is_that_of_its_service(settings: ZenohSettings) -> None:
+    line = worker.worker_arguments(settings, "rig7", "flow-3")
+    args = worker.worker_parser("worker", worker="flow-0").parse_args(line)
+    assert (args.rig, args.worker, args.parent) == ("rig7", "flow-3", os.getpid())
+    expected = replace(
+        settings, connect=settings.connect or f"tcp/127.0.0.1:{settings.port}", port=ZenohSettings().port
+    )
+    assert worker.zenoh_settings(args) == expected
+
+
+def test_restarts_back_off() -> None:
+    assert [restart_delay_s(n) for n in (1, 2, 3, 4)] == [0.0, 0.1, 0.2, 0.4]
+    assert restart_delay_s(50) == 10.0
+
+
+@pytest.mark.parametrize(
+    ("stages", "name", "text"),
+    [
+        (("camera",), "", "unknown stage camera"),
+        (("flow", "depth"), "flow-1", "goes with its one stage"),
+        (("flow",), "depth-0", "goes with its one stage"),
+    ],
+)
+def test_a_supervisor_refuses_stages_that_are_none(stages: tuple[str, ...], name: str, text: str) -> None:
+    with pytest.raises(ValueError, match=text):
+        Supervisor(Settings(), plain_calibration(), stages, name)
+
+
+def test_a_supervisor_without_calibration_needs_a_service_to_ask() -> None:
+    with pytest.raises(ValueError, match="calibration is needed"):
+        Supervisor(Settings(), None)
+
+
+def ended(code: str) -> str:
+    child = ChildProcess([sys.executable, "-c", code], on_line=lambda _: None)
+    assert child.wait(10.0)
+    why = child.why()
+    child.close()
+    return why
+
+
+def test_a_dead_process_says_how_it_ended_and_its_last_words() -> None:
+    said = "import sys, os, signal; print('one', file=sys.stderr); print('two', file=sys.stderr); "
+    assert ended(said + "sys.exit(3)") == "ended with exit code 3; last lines: one | two"
+    assert ended("import os, signal; os.kill(os.getpid(), signal.SIGKILL)") == "killed by SIGKILL"
+
+
+def test_a_process_that_ignores_sigterm_is_killed() -> None:
+    deaf = "import signal, sys, time; signal.signal(15, signal.SIG_IGN); print('deaf', flush=True); time.sleep(60)"
+    child = ChildProcess([sys.executable, "-c", deaf], on_line=lambda _: None)
+    deadline_s = time.monotonic() + 10.0
+    while not child.has_said("deaf") and time.monotonic() < deadline_s:
+        time.sleep(0.01)
+    stop_all([child], patience_s=0.2)
+    assert child.exit_code() == -9
+
+
+def test_kernels_are_cached_elsewhere_only_where_nothing_else_can_be_written(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    ensure_cache_directory()
+    assert "NUMBA_CACHE_DIR" not in os.environ
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "")
+    monkeypatch.delenv("NUMBA_CACHE_DIR")
+    ensure_cache_directory()
+    assert os.environ["NUMBA_CACHE_DIR"].endswith(f"velod-numba-{os.getuid()}")
