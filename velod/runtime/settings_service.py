@@ -15,6 +15,9 @@ from velod.config import Settings
 from velod.geometry.calibration import Calibration
 from velod.wire.topics import CALIBRATION, CONFIG, Topic, key
 
+ANSWER_S = 10.0
+"""How long a service may take to answer."""
+
 
 class NoServiceError(OSError):
     """Nobody serves this rig's settings; the text names the rig and the endpoint."""
@@ -36,12 +39,12 @@ def serve(session: zenoh.Session, settings: Settings, calibration: Calibration) 
             queryable.undeclare()
 
 
-def fetch(session: zenoh.Session, rig: str, endpoint: str, timeout_s: float = 10.0) -> tuple[Settings, Calibration]:
+def fetch(session: zenoh.Session, rig: str, endpoint: str) -> tuple[Settings, Calibration]:
     """Settings and calibration of the service at ``endpoint``.
 
     Raises NoServiceError where nobody answers, ConfigError and CalibrationError for an answer of no use.
     """
-    deadline_s = time.monotonic() + timeout_s
+    deadline_s = time.monotonic() + ANSWER_S
     trees = []
     for topic in (CONFIG, CALIBRATION):
         while (tree := _ask(session, key(topic, rig))) is None:
