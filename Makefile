@@ -34,8 +34,10 @@ $(BIN)/python:
 
 $(RUN): pyproject.toml constraints.txt | $(BIN)/python
 	$(PIP) -e .
+	$(BIN)/velod warmup
 	touch $@
 
 $(DEV): pyproject.toml constraints.txt | $(BIN)/python
 	$(PIP) -e '.[h5,plot,test,check]'
+	$(BIN)/velod warmup
 	touch $@ $(RUN)

@@ -197,7 +197,7 @@ def summary(played: Played, metrics: Metrics | None) -> str:
             f"latency        {played.latency_p50_ms:8.2f} ms    (p50; p99 {played.latency_p99_ms:.2f} ms; "
             "from a batch's end to the velocity that used it)"
         )
-    lines += [f"lost           {worker}: {text}" for worker, text in _losses(played.counters)]
+    lines += [f"dropped        {worker}: {text}" for worker, text in _losses(played.counters)]
     return "\n".join(lines)
 
 
@@ -261,7 +261,7 @@ def demo(config: str | None, name: str, seconds: float, seed: int, csv: str | No
     from velod.sim import simulated_recording
 
     settings_of(config)  # what is wrong with it must not wait for the simulation
-    print(f"simulating {seconds:g} s of {name} (kept for the next time)", file=sys.stderr)
+    print(f"simulating {seconds:g} s of {name}: takes minutes the first time, then it is kept", file=sys.stderr)
     with _Bar("simulating") as bar:
         path = simulated_recording(name, seconds, seed, bar.show)
     played = play(config, str(path), PlayOptions())

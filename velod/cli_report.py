@@ -6,6 +6,7 @@ import csv
 import json
 import logging
 import math
+import shutil
 import sys
 import time
 from collections import deque
@@ -65,6 +66,8 @@ class Line:
     def draw(self, text: str) -> None:
         """Show ``text`` in place of what was there."""
         self._next_s = time.monotonic() + _REDRAW_S
+        # A line that wraps could not be drawn over.
+        text = text[: shutil.get_terminal_size().columns - 1]
         with self._lock:
             self._text = text
             self._write(f"\r\x1b[K{text}")
