@@ -27,7 +27,7 @@ MODEL_VERSION = 2
 def simulated_recording(name: str, seconds: float, seed: int, progress: Progress | None = None) -> Path:
     """Path of a recording of the sequence ``name``, simulated unless an equal one was before.
 
-    Kept, uncompressed (13 bytes an event), in ``$VELOD_CACHE_DIR``, ``$XDG_CACHE_HOME/velod`` or ``~/.cache/velod``.
+    Kept (3 bytes an event) in ``$VELOD_CACHE_DIR``, ``$XDG_CACHE_HOME/velod`` or ``~/.cache/velod``.
     Raises SequenceError, RecordingError.
     """
     recipe = sequence(name)
@@ -37,7 +37,7 @@ def simulated_recording(name: str, seconds: float, seed: int, progress: Progress
     try:
         open_recording(path)
     except RecordingError:  # missing, or cut short by a crash
-        simulate(recipe, seconds, seed, path, progress, compress=False)
+        simulate(recipe, seconds, seed, path, progress)
     return path
 
 

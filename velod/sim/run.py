@@ -33,8 +33,6 @@ def simulate(
     seed: int,
     path: str | Path,
     progress: Progress | None = None,
-    *,
-    compress: bool = True,
 ) -> None:
     """Write ``seconds`` of ``sequence`` to ``path``; on one machine equal arguments give equal bytes.
 
@@ -43,7 +41,7 @@ def simulate(
     imu_rng, left_rng, right_rng = (np.random.default_rng((seed, k)) for k in range(3))
     end_us = round(seconds * 1e6)
     depths: list[F32] = []
-    with RecordingWriter(path, sequence.calibration, compress=compress) as writer:
+    with RecordingWriter(path, sequence.calibration) as writer:
         for block in _render(sequence, end_us, left_rng, right_rng):
             writer.append("left", block.left)
             writer.append("right", block.right)

@@ -18,7 +18,8 @@ from velod.types import F64
 BASELINE_M = 0.12
 
 # Fast turns sweep more of it past a pixel: fewer, larger leaves keep the event rate in bounds.
-_ROOM_TEXTURE = TextureRecipe(leaves=900, smallest_m=0.16, largest_m=1.0, darkest=0.12)
+_ROOM_TEXTURE = TextureRecipe(leaves=1100, smallest_m=0.15, largest_m=1.0, darkest=0.12)
+_SPIN_TEXTURE = TextureRecipe(leaves=500, smallest_m=0.22, largest_m=1.2, darkest=0.15)
 
 
 class SequenceError(ValueError):
@@ -129,7 +130,7 @@ def _spin(name: str, speed: float, rate: float) -> Sequence:
     )
     keep_clear = trajectory.at(np.linspace(0.0, 30.0, 3000)).p_WB
     boxes = scatter_boxes(size_m, keep_clear, clearance_m=0.8, count=16, seed=6)
-    return Sequence(name, trajectory, room(size_m, boxes, seed=6), _ROOM_TEXTURE)
+    return Sequence(name, trajectory, room(size_m, boxes, seed=6), _SPIN_TEXTURE)
 
 
 def mean_motion(trajectory: Trajectory, seconds: float = 60.0) -> tuple[float, float]:
