@@ -136,7 +136,7 @@ class Estimator:
 
     def _rows(self, flow: FlowBatch, depth: DepthBatch) -> tuple[Rows, Rows] | None:
         """Rows of the flow equation where flow and depth speak of the same event: on the spline, and on e."""
-        _, at_flow, at_depth = np.intersect1d(flow.index, depth.index, assume_unique=True, return_indices=True)
+        at_flow, at_depth = flow_equation.pairs(flow.index, depth.index)
         t = flow.t_ns - flow.age[at_flow].astype(np.int64)
         inside = (t >= self.memory.t_ns[0]) & (self.window.empty | (t >= self.window.first * self._knot_ns))
         at_flow, at_depth, t = at_flow[inside], at_depth[inside], t[inside]
@@ -149,14 +149,15 @@ class Estimator:
         )
         R_LB, s_L, w_B = self.memory.at(t)
         # Eq. 4: |x_n| - n^T B w = (n^T A / Z) v
-        z = flow.speed[at_flow].astype(np.float64) - np.einsum("ij,ij->i", b_B, w_B)
+        on_velocity = flow_equation.on_velocity(t, flow.speed[at_flow].astype(np.float64), a_B, b_B, w_B)
         if self._o.weights == "fixed":
-            sigma = np.full(len(t), self._o.fixed_sigma_px_s)
+            on_velocity.sigma[:] = self._o.fixed_sigma_px_s
         else:
-            sigma = flow_equation.sigmas(flow.sigma[at_flow], inv_depth, depth.sigma[at_depth], z)
-        a_L = np.einsum("ijk,ik->ij", R_LB, a_B)
-        on_error = Rows(t, z - np.einsum("ij,ij->i", a_L, s_L), a_L, b_B, sigma)
-        return on_error if self._o.spline == "error" else Rows(t, z, a_B, b_B, sigma), on_error
+            on_velocity.sigma[:] = flow_equation.sigmas(
+                flow.sigma[at_flow], inv_depth, depth.sigma[at_depth], on_velocity.z
+            )
+        on_error = flow_equation.on_error(on_velocity, R_LB, s_L)
+        return on_error if self._o.spline == "error" else on_velocity, on_error
 
     def _fit(self, t_ns: int, on_error: Rows) -> Fit | None:
         """The batch's own solution for e at ``t_ns``: gravity, which e holds, is taken from what is known of it."""

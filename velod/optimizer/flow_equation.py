@@ -10,13 +10,15 @@ rows in the frame of the estimated error e. Robust weights come from the batch's
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
 
+from velod.events.columns import readonly
 from velod.geometry.camera import motion_field_rows
-from velod.types import F32, F64, I64
+from velod.types import F32, F64, I64, U16
 
 MODEL_SIGMA_PX_S = 2.0
 """Flow error that neither fit nor depth accounts for (DESIGN 5.5)."""
@@ -67,8 +69,8 @@ def body_rows(
     """
     f, cx, cy = camera
     nA, nB = motion_field_rows(xy[0].astype(np.float64), xy[1].astype(np.float64), f, cx, cy, n.astype(np.float64))
-    a_B = (nA * inv_depth.astype(np.float64)[:, None]) @ R_CB
-    b_B = nB @ R_CB + np.cross(p_BC_B, a_B)
+    a_B, b_B = np.empty_like(nA), np.empty_like(nB)
+    _to_body(nA, nB, inv_depth.astype(np.float64), R_CB, p_BC_B, a_B, b_B)
     return a_B, b_B
 
 
@@ -76,6 +78,30 @@ def sigmas(speed_sigma: F32, inv_depth: F32, inv_depth_sigma: F32, translational
     """Standard deviation of a row, px/s, (m,): fit, model, and the depth's share of the translational flow."""
     from_depth = translational * inv_depth_sigma / inv_depth
     return np.sqrt(speed_sigma.astype(np.float64) ** 2 + MODEL_SIGMA_PX_S**2 + from_depth**2)
+
+
+def on_velocity(t_ns: I64, speed: F64, a_B: F64, b_B: F64, w_B: F64) -> Rows:
+    """Rows on v_B and b_w from those of ``body_rows`` and the measured w_B (m, 3); sigma is left to be set."""
+    m = len(t_ns)
+    z = np.empty(m)
+    _less_product(speed, b_B, w_B, z)
+    return Rows(t_ns, z, a_B, b_B, np.empty(m))
+
+
+def on_error(rows: Rows, R_LB: F64, s_L: F64) -> Rows:
+    """Rows on the error e of the integrated velocity, v_B = R_BL (s_L + e), from those on v_B."""
+    z, a_L = np.empty_like(rows.z), np.empty_like(rows.a)
+    _rotate(R_LB, rows.a, a_L)
+    _less_product(rows.z, a_L, s_L, z)
+    return Rows(rows.t_ns, z, a_L, rows.b, rows.sigma)
+
+
+def pairs(flow_index: U16, depth_index: U16) -> tuple[I64, I64]:
+    """Positions in both of the values that two increasing columns share."""
+    at_flow = np.empty(min(len(flow_index), len(depth_index)), np.int64)
+    at_depth = np.empty_like(at_flow)
+    n = _pairs(readonly(flow_index, np.uint16), readonly(depth_index, np.uint16), at_flow, at_depth)
+    return at_flow[:n], at_depth[:n]
 
 
 def solve(rows: Rows, iterations: int, seed: int) -> Fit | None:
@@ -96,21 +122,121 @@ def compress(rows: Rows, fit: Fit, bin_ns: int, gyro_noise: float, shared_error:
     That noise moves all flows of a moment together: a nuisance n_w of variance gyro_noise^2 / bin, which enters as
     b_w does. ``shared_error`` divides the information of the flows, for errors they share within a batch.
     """
-    bins = rows.t_ns // bin_ns
-    w = fit.weight / (rows.sigma * fit.scale) ** 2 / shared_error
-    noise_information = np.eye(3) * (bin_ns * 1e-9) / gyro_noise**2
-    out = []
-    for k in np.unique(bins[w > 0]):
-        at = np.flatnonzero((bins == k) & (w > 0))
-        J = np.hstack([rows.a[at], -rows.b[at]])
-        Jw = J * w[at, None]
-        L, eta = Jw.T @ J, Jw.T @ rows.z[at]
-        # nuisance n_w: its columns are those of b_w
-        gain = np.linalg.solve(L[3:, 3:] + noise_information, np.hstack([L[3:, :], eta[3:, None]]))
-        K = L[:, 3:]
-        t = int(np.average(rows.t_ns[at] - k * bin_ns, weights=w[at])) + int(k) * bin_ns
-        out.append(Information(t, L - K @ gain[:, :6], eta - K @ gain[:, 6]))
-    return out
+    first = int(rows.t_ns.min()) // bin_ns
+    count = int(rows.t_ns.max()) // bin_ns - first + 1
+    L, eta, total, t_ns = np.zeros((count, 6, 6)), np.zeros((count, 6)), np.zeros((count, 2)), np.empty(count, np.int64)
+    noise_information = bin_ns * 1e-9 / gyro_noise**2
+    _compress(
+        rows.t_ns, rows.z, rows.a, rows.b, rows.sigma, fit.weight, fit.scale**2 * shared_error,
+        first, bin_ns, noise_information, total, t_ns, L, eta,
+    )  # fmt: skip
+    return [Information(int(t_ns[k]), L[k], eta[k]) for k in range(count) if total[k, 0] > 0.0]
+
+
+@njit(cache=True, nogil=True)
+def _pairs(left: U16, right: U16, at_left: I64, at_right: I64) -> int:
+    i = j = n = 0
+    while i < left.size and j < right.size:
+        if left[i] < right[j]:
+            i += 1
+        elif left[i] > right[j]:
+            j += 1
+        else:
+            at_left[n], at_right[n] = i, j
+            i, j, n = i + 1, j + 1, n + 1
+    return n
+
+
+@njit(cache=True, nogil=True)
+def _to_body(nA: F64, nB: F64, inv_depth: F64, R_CB: F64, p: F64, a: F64, b: F64) -> None:
+    """a = nA R_CB / Z, b = nB R_CB + p x a, row by row."""
+    for k in range(inv_depth.size):
+        for i in range(3):
+            a[k, i] = inv_depth[k] * (nA[k, 0] * R_CB[0, i] + nA[k, 1] * R_CB[1, i] + nA[k, 2] * R_CB[2, i])
+            b[k, i] = nB[k, 0] * R_CB[0, i] + nB[k, 1] * R_CB[1, i] + nB[k, 2] * R_CB[2, i]
+        b[k, 0] += p[1] * a[k, 2] - p[2] * a[k, 1]
+        b[k, 1] += p[2] * a[k, 0] - p[0] * a[k, 2]
+        b[k, 2] += p[0] * a[k, 1] - p[1] * a[k, 0]
+
+
+@njit(cache=True, nogil=True)
+def _rotate(R: F64, a: F64, out: F64) -> None:
+    for k in range(len(a)):
+        for i in range(3):
+            out[k, i] = R[k, i, 0] * a[k, 0] + R[k, i, 1] * a[k, 1] + R[k, i, 2] * a[k, 2]
+
+
+@njit(cache=True, nogil=True)
+def _less_product(z: F64, a: F64, x: F64, out: F64) -> None:
+    """out = z - a . x, row by row."""
+    for k in range(z.size):
+        out[k] = z[k] - (a[k, 0] * x[k, 0] + a[k, 1] * x[k, 1] + a[k, 2] * x[k, 2])
+
+
+@njit(cache=True, nogil=True)
+def _compress(
+    t_ns: I64,
+    z: F64,
+    a: F64,
+    b: F64,
+    sigma: F64,
+    weight: F64,
+    variance: float,
+    first: int,
+    bin_ns: int,
+    noise_information: float,
+    total: F64,
+    t_out: I64,
+    L: F64,
+    eta: F64,
+) -> None:
+    """Per bin: weights and weighted times into ``total``, their mean time, and L and eta without the nuisance."""
+    row = np.empty(6)
+    for k in range(z.size):
+        if not weight[k] > 0.0:
+            continue
+        w = weight[k] / (sigma[k] * sigma[k] * variance)
+        at = t_ns[k] // bin_ns - first
+        total[at, 0] += w
+        total[at, 1] += w * (t_ns[k] - (at + first) * bin_ns)
+        for i in range(3):
+            row[i], row[3 + i] = a[k, i], -b[k, i]
+        for i in range(6):
+            wi = w * row[i]
+            eta[at, i] += wi * z[k]
+            for j in range(i, 6):
+                L[at, i, j] += wi * row[j]
+    for at in range(len(total)):
+        if total[at, 0] > 0.0:
+            t_out[at] = (at + first) * bin_ns + int(total[at, 1] / total[at, 0])
+            _marginalise_nuisance(L[at], eta[at], noise_information)
+
+
+@njit(cache=True, nogil=True)
+def _marginalise_nuisance(L: F64, eta: F64, noise_information: float) -> None:
+    """L - K S^-1 K^T and eta - K S^-1 eta_b, with K the columns of b_w and S their block plus the noise's.
+
+    ``L`` (6, 6) comes as its upper triangle and leaves whole. S is factorised C C^T; G = C^-1 [K^T, eta_b].
+    """
+    for i in range(6):
+        for j in range(i):
+            L[i, j] = L[j, i]
+    C, G = np.zeros((3, 3)), np.empty((3, 7))
+    for i in range(3):
+        for j in range(i + 1):
+            s = L[3 + i, 3 + j] + (noise_information if i == j else 0.0)
+            for q in range(j):
+                s -= C[i, q] * C[j, q]
+            C[i, j] = math.sqrt(s) if i == j else s / C[j, j]
+        for c in range(7):
+            g = L[3 + i, c] if c < 6 else eta[3 + i]
+            for q in range(i):
+                g -= C[i, q] * G[q, c]
+            G[i, c] = g / C[i, i]
+    for i in range(6):
+        eta[i] -= G[0, i] * G[0, 6] + G[1, i] * G[1, 6] + G[2, i] * G[2, 6]
+        for j in range(6):
+            L[i, j] -= G[0, i] * G[0, j] + G[1, i] * G[1, j] + G[2, i] * G[2, j]
 
 
 @njit(cache=True, nogil=True)
@@ -169,6 +295,8 @@ def _ransac(a, z, sigma, iterations, seed, best, H, g):  # type: ignore[no-untyp
         for k in range(m):
             r = (z[k] - a[k, 0] * x[0] - a[k, 1] * x[1] - a[k, 2] * x[2]) / sigma[k]
             cost += min(r * r, 9.0)
+            if cost >= best_cost:
+                break
         if cost < best_cost:
             best_cost = cost
             best[:] = x

@@ -8,13 +8,15 @@ information matrix, and leaving the window (marginalisation) is a Schur compleme
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from numba import njit
 
 from velod.config import ImuSettings
 from velod.geometry.so3 import hat
 from velod.optimizer.spline import basis, locate
-from velod.types import F64
+from velod.types import F64, I64
 
 BLOCK = 12
 """States of one segment: control point, b_a, b_w, g_L."""
@@ -25,17 +27,24 @@ UNKNOWN_VELOCITY = 100.0
 NORM_SIGMA = 0.02
 """Of |g| = gravity, m/s^2: local gravity differs from the setting."""
 
+_GONE = np.concatenate([np.arange(3), HEAD + np.arange(3, BLOCK)])
+"""Columns of what leaves with the oldest segment: its first control point, its biases and its gravity."""
+_SELECTED = np.arange(3, BLOCK)
+
 
 class Solution:
-    """States of the window at their optimum."""
+    """States of the window at their optimum; valid until the window's next solve, whose workspace it uses."""
 
-    def __init__(self, x: F64, factor: tuple[F64, bool]) -> None:
+    def __init__(self, x: F64, U: F64, last: I64) -> None:
         self.x = x
-        self._factor = factor
+        self._U, self._last = U, last
 
     def cov(self, F: F64) -> F64:
         """Covariance of F x, for F of shape (r, n)."""
-        return np.asarray(F @ cho_solve(self._factor, F.T))
+        Y = np.ascontiguousarray(F.T)
+        out = np.zeros((len(F), len(F)))
+        _covariance(self._U, self._last, Y, out)
+        return out
 
 
 class Window:
@@ -50,6 +59,8 @@ class Window:
         size = HEAD + BLOCK * (segments + 1)
         self._H = np.zeros((size, size))
         self._h = np.zeros(size)
+        self._end = np.zeros(size, np.int64)  # no state at or after it has met that of the row in a factor
+        self._U, self._last = np.zeros((size, size)), np.empty(size, np.int64)  # of the last solve
         self.first = 0
         self.last = -1
 
@@ -72,6 +83,7 @@ class Window:
         self.first = self.last = locate(t_ns, self._knot_ns)[0]
         self._H[:] = 0.0
         self._h[:] = 0.0
+        self._end[:] = np.arange(1, len(self._end) + 1)
         at = np.arange(HEAD)
         self._H[at, at] = 1.0 / UNKNOWN_VELOCITY**2
         b = self.bias_columns(self.last)
@@ -122,61 +134,56 @@ class Window:
         """F (3, n) with F x = the spline at ``t_ns`` (Eq. 7)."""
         segment, u = locate(t_ns, self._knot_ns)
         F = np.zeros((3, self.size))
-        for column, weight in zip(self.control_columns(segment), basis(u), strict=True):
-            F[np.arange(3), column + np.arange(3)] = weight
+        self._place_spline(F, segment, basis(u))
         return F
 
     def selector(self, t_ns: int) -> F64:
         """F (12, n) with F x = [spline at t_ns, b_a, b_w, g_L of its segment]."""
-        segment, _ = locate(t_ns, self._knot_ns)
+        segment, u = locate(t_ns, self._knot_ns)
         F = np.zeros((12, self.size))
-        F[:3] = self.spline_row(t_ns)
-        F[np.arange(3, 9), self.bias_columns(segment)] = 1.0
-        F[np.arange(9, 12), self.gravity_columns(segment)] = 1.0
+        self._place_spline(F, segment, basis(u))
+        own = HEAD + BLOCK * (segment - self.first)
+        F[_SELECTED, own + _SELECTED] = 1.0
         return F
+
+    def _place_spline(self, F: F64, segment: int, weights: F64) -> None:
+        for column, weight in zip(self.control_columns(segment), weights.tolist(), strict=True):
+            F[0, column] = F[1, column + 1] = F[2, column + 2] = weight
 
     def add(self, J: F64, r: F64, information: F64) -> None:
         """A factor (J x - r)^T information (J x - r)."""
-        H, h = self._H, self._h
-        columns = np.flatnonzero(J.any(axis=0))
-        Jc = J[:, columns]
-        weighted = Jc.T @ information
-        H[np.ix_(columns, columns)] += weighted @ Jc
-        h[columns] += weighted @ r
+        _add_factor(self._H, self._h, self._end, J, r, information)
 
     def add_information(self, t_ns: int, L: F64, eta: F64) -> None:
         """Information (6, 6) of [spline, b_w] at ``t_ns``."""
         segment, u = locate(t_ns, self._knot_ns)
-        weights = basis(u)
-        spread = np.zeros((6, 15))
-        for i in range(4):
-            spread[:3, 3 * i : 3 * i + 3] = weights[i] * np.eye(3)
-        spread[3:, 12:] = np.eye(3)
-        columns = np.concatenate(
-            [c + np.arange(3) for c in self.control_columns(segment)] + [self.bias_columns(segment)[3:]]
-        )
-        self._H[np.ix_(columns, columns)] += spread.T @ L @ spread
-        self._h[columns] += spread.T @ eta
+        bias = HEAD + BLOCK * (segment - self.first) + 6
+        columns = np.array([*self.control_columns(segment), bias])
+        _add_information(self._H, self._h, self._end, columns, basis(u), L, eta)
 
     def solve(self, extra: list[tuple[F64, F64, F64]], g_prior: F64 | None, g_sigma: float) -> Solution:
         """The optimum with further factors (J, r, information) that are not kept.
 
         ``g_prior``: last estimate of g_L, ``g_sigma`` the sigma of its direction (rad). The norm of gravity is a
         factor along it on the newest segment, weakened by what a wrong direction would do to the linearisation.
+        Raises numpy.linalg.LinAlgError where the information does not determine the states.
         """
         n = self.size
-        H, h = self._H[:n, :n].copy(), self._h[:n].copy()
+        U, last, x = self._U, self._last, self._h[:n].copy()
+        U[:n, :n] = self._H[:n, :n]
+        last[:n] = self._end[:n]
         for J, r, information in extra:
-            H += J.T @ information @ J
-            h += J.T @ information @ r
+            _add_factor(U, x, last, J, r, information)
         if g_prior is not None:
             direction = g_prior / np.linalg.norm(g_prior)
             sigma = NORM_SIGMA + self._imu.gravity * g_sigma**2
-            g = self.gravity_columns(self.last)
-            H[np.ix_(g, g)] += np.outer(direction, direction) / sigma**2
-            h[g] += direction * self._imu.gravity / sigma**2
-        factor = cho_factor(H, lower=True)
-        return Solution(cho_solve(factor, h), factor)
+            g = slice(n - 3, n)
+            U[g, g] += np.outer(direction, direction) / sigma**2
+            x[g] += direction * self._imu.gravity / sigma**2
+        if not _factorise(U, last, n):
+            raise np.linalg.LinAlgError("the information of the window is not positive definite")
+        _substitute(U, last, x)
+        return Solution(x, U, last)
 
     def _smooth_newest(self) -> None:
         """The newest control point continues the line through the two before, weakly."""
@@ -188,18 +195,149 @@ class Window:
 
     def _marginalise_oldest(self) -> None:
         """Schur complement of the oldest control point, biases and gravity; the rest moves up."""
-        n = self.size
-        first_block = np.arange(HEAD, HEAD + BLOCK)
-        gone = np.concatenate([np.arange(3), first_block[3:]])
-        kept = np.concatenate([np.arange(3, HEAD), first_block[:3], np.arange(HEAD + BLOCK, n)])
-        H, h = self._H[:n, :n], self._h[:n]
-        factor = cho_factor(H[np.ix_(gone, gone)], lower=True)
-        cross = H[np.ix_(gone, kept)]
-        kept_H = H[np.ix_(kept, kept)] - cross.T @ cho_solve(factor, cross)
-        kept_h = h[kept] - cross.T @ cho_solve(factor, h[gone])
-        m = n - BLOCK
-        self._H[:] = 0.0
-        self._h[:] = 0.0
-        self._H[:m, :m] = 0.5 * (kept_H + kept_H.T)
-        self._h[:m] = kept_h
+        n, m = self.size, self.size - BLOCK
+        H, h, end = self._H, self._h, self._end
+        # states that met one of those that go now meet each other
+        reach = int(end[_GONE].max())
+        _eliminate(H, h, _GONE, reach)
+        newer = slice(HEAD + BLOCK, n)
+        H[:HEAD, :HEAD] = H[3 : 3 + HEAD, 3 : 3 + HEAD]
+        H[:HEAD, HEAD:m] = H[3 : 3 + HEAD, newer]
+        H[HEAD:m, :HEAD] = H[newer, 3 : 3 + HEAD]
+        H[HEAD:m, HEAD:m] = H[newer, newer]
+        h[:HEAD], h[HEAD:m] = h[3 : 3 + HEAD], h[newer]
+        end[:HEAD] = np.maximum(end[3 : 3 + HEAD], reach) - BLOCK
+        end[HEAD:m] = np.maximum(end[newer] - BLOCK, np.arange(HEAD + 1, m + 1))
+        H[m:], H[:, m:], h[m:] = 0.0, 0.0, 0.0
+        end[m:] = np.arange(m + 1, len(end) + 1)
         self.first += 1
+
+
+@njit(cache=True, nogil=True)
+def _add_factor(H: F64, h: F64, end: I64, J: F64, r: F64, information: F64) -> None:
+    """H += J^T information J and h += J^T information r, over the columns of J (m, n) that are not zero."""
+    m, n = J.shape
+    columns, row = np.empty(n, np.int64), np.empty(m)
+    count = 0
+    for c in range(n):
+        for p in range(m):
+            if J[p, c] != 0.0:
+                columns[count] = c
+                count += 1
+                break
+    for a in range(count):
+        i = columns[a]
+        end[i] = max(end[i], columns[count - 1] + 1)
+        for q in range(m):
+            row[q] = 0.0
+            for p in range(m):
+                row[q] += J[p, i] * information[p, q]
+            h[i] += row[q] * r[q]
+        for b in range(a, count):
+            j = columns[b]
+            s = 0.0
+            for q in range(m):
+                s += row[q] * J[q, j]
+            H[i, j] += s
+            if i != j:
+                H[j, i] += s
+
+
+@njit(cache=True, nogil=True)
+def _add_information(H: F64, h: F64, end: I64, columns: I64, weights: F64, L: F64, eta: F64) -> None:
+    """L (6, 6), eta (6,) of [sum of weights * control points, b_w]; ``columns`` (5,): the four points, then b_w."""
+    for a in range(5):
+        wa, la = (weights[a], 0) if a < 4 else (1.0, 3)
+        for i in range(3):
+            row = columns[a] + i
+            end[row] = max(end[row], columns[4] + 3)
+            h[row] += wa * eta[la + i]
+            for b in range(5):
+                w, lb = (wa * weights[b], 0) if b < 4 else (wa, 3)
+                for j in range(3):
+                    H[row, columns[b] + j] += w * L[la + i, lb + j]
+
+
+@njit(cache=True, nogil=True)
+def _eliminate(H: F64, h: F64, gone: I64, reach: int) -> None:
+    """Schur complement of the states ``gone``, none of which has met one at or after ``reach``."""
+    for p in gone:
+        for i in range(reach):
+            if i == p or H[i, p] == 0.0:
+                continue
+            f = H[i, p] / H[p, p]
+            h[i] -= f * h[p]
+            for j in range(i, reach):
+                H[i, j] -= f * H[p, j]
+                H[j, i] = H[i, j]
+        H[p, :] = 0.0
+        H[:, p] = 0.0
+
+
+@njit(cache=True, nogil=True)
+def _factorise(U: F64, last: I64, n: int) -> bool:
+    """H = U^T U in place, for the upper triangle of H (n, n) in ``U``; ``last`` bounds its rows. False: not definite.
+
+    Three rows at a time: the envelope of a row is that of the block (n is a multiple of 3), and fills up with that of
+    the rows before, so ``last`` is raised accordingly.
+    """
+    reach = 0
+    for k in range(0, n, 3):
+        for i in range(k, k + 3):
+            reach = max(reach, last[i])
+        last[k : k + 3] = reach
+        for i in range(k, k + 3):
+            for p in range(k, i):
+                f = U[p, i]
+                for j in range(i, reach):
+                    U[i, j] -= f * U[p, j]
+            if not U[i, i] > 0.0:
+                return False
+            scale = 1.0 / math.sqrt(U[i, i])
+            for j in range(i, reach):
+                U[i, j] *= scale
+        u0, u1, u2 = U[k], U[k + 1], U[k + 2]
+        for i in range(k + 3, reach):
+            f0, f1, f2 = u0[i], u1[i], u2[i]
+            row = U[i]
+            for j in range(i, reach):
+                row[j] -= f0 * u0[j] + f1 * u1[j] + f2 * u2[j]
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _substitute(U: F64, last: I64, x: F64) -> None:
+    """x <- (U^T U)^-1 x, in place."""
+    n = len(x)
+    for i in range(n):
+        x[i] /= U[i, i]
+        for j in range(i + 1, last[i]):
+            x[j] -= U[i, j] * x[i]
+    for i in range(n - 1, -1, -1):
+        s = x[i]
+        for j in range(i + 1, last[i]):
+            s -= U[i, j] * x[j]
+        x[i] = s / U[i, i]
+
+
+@njit(cache=True, nogil=True)
+def _covariance(U: F64, last: I64, Y: F64, out: F64) -> None:
+    """out += F (U^T U)^-1 F^T, for Y (n, r) = F^T, which is overwritten with U^-T F^T."""
+    n, r = Y.shape
+    started = False
+    for i in range(n):
+        if not started:
+            for a in range(r):
+                started = started or Y[i, a] != 0.0
+            if not started:
+                continue
+        for a in range(r):
+            Y[i, a] /= U[i, i]
+        for j in range(i + 1, last[i]):
+            f = U[i, j]
+            for a in range(r):
+                Y[j, a] -= f * Y[i, a]
+        for a in range(r):
+            f = Y[i, a]
+            for b in range(r):
+                out[a, b] += f * Y[i, b]
