@@ -8,7 +8,7 @@ import numpy as np
 
 from velod.geometry.calibration import Calibration, Camera
 from velod.io.model import EventColumns, Imu, SequenceData, Truth
-from velod.io.sequence import RecordingWriter
+from velod.io.sequence import write_recording
 
 CAMERA = Camera(width=240, height=180, fx=200.0, fy=200.0, cx=119.5, cy=89.5)
 RIG = Calibration(left=CAMERA, right=CAMERA, R_RL=np.eye(3), t_RL=np.array([-0.1, 0.0, 0.0]))
@@ -53,8 +53,5 @@ def write(path: Path, seconds: float) -> Path:
     level = np.tile([-(0.5**0.5), 0.0, 0.0, 0.5**0.5], (n, 1))
     truth = Truth(samples.t_ns, np.tile(V_B, (n, 1)), still, level)
     data = SequenceData(RIG, events(seconds, 0, 1), events(seconds, DISPARITY_PX, 2), samples, truth)
-    with RecordingWriter(path, RIG, compress=False) as writer:
-        writer.append("left", data.left)
-        writer.append("right", data.right)
-        writer.finish(data.imu, data.truth, data.depth)
+    write_recording(path, data)
     return path

@@ -203,12 +203,14 @@ def test_a_stopped_consumer_disturbs_nobody(slanted: Path, settings: Settings) -
 
 
 SERVICE = """
-import logging, sys
+import sys
 from velod.config import Settings, ZenohSettings
-from velod.runtime.supervisor import supervise
+from velod.runtime.supervisor import Supervisor
 from velod.runtime.warmup import plain_calibration
-logging.basicConfig(level=logging.INFO)
-supervise(Settings(zenoh=ZenohSettings(port=int(sys.argv[1]))), plain_calibration())
+from velod.runtime.worker import stop_on_signals
+stop = stop_on_signals()
+with Supervisor(Settings(zenoh=ZenohSettings(port=int(sys.argv[1]))), plain_calibration()) as supervisor:
+    supervisor.run(stop)
 """
 
 

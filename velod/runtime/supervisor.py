@@ -28,7 +28,7 @@ from velod.runtime.session import introducer_endpoint, open_session
 from velod.runtime.settings_service import fetch, serve
 from velod.runtime.spare import READY
 from velod.runtime.stages import STAGES, stage_of, worker_names
-from velod.runtime.worker import stop_on_signals, worker_arguments
+from velod.runtime.worker import worker_arguments
 from velod.wire.topics import ALIVE, HEALTH, key, parts
 
 log = logging.getLogger("velod.supervisor")
@@ -266,12 +266,3 @@ class Supervisor:
 def restart_delay_s(quick_deaths: int) -> float:
     """None after a first death, then twice as long each time, up to a limit."""
     return 0.0 if quick_deaths <= 1 else min(FIRST_DELAY_S * 2.0 ** (quick_deaths - 2), LAST_DELAY_S)
-
-
-def supervise(
-    settings: Settings, calibration: Calibration | None, stages: Sequence[str] = STAGES, worker: str = ""
-) -> None:
-    """Run the service, or some stages of one, until SIGTERM or SIGINT. Raises as Supervisor does."""
-    stop = stop_on_signals()
-    with Supervisor(settings, calibration, stages, worker) as supervisor:
-        supervisor.run(stop)
