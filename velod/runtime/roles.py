@@ -118,11 +118,13 @@ class BatchShell(WorkerShell):
 
     def publish(self, outputs: Sequence[Message], cause: Envelope) -> None:
         """The result, and Done even where there is none: the dispatcher must not wait for ever."""
-        for output in outputs:
-            t_pub_ns = self.outlet.publish(self.output, output, cause.t_origin_ns)
-            self.health.add_latency("stage", t_pub_ns - cause.t_pub_ns)
-        done = Done(cause.message.seq, cause.message.t_ns, self.stage_name, self.worker)
-        self.outlet.publish(DONE, done, cause.t_origin_ns, stage=self.stage_name)
+        try:
+            for output in outputs:
+                t_pub_ns = self.outlet.publish(self.output, output, cause.t_origin_ns)
+                self.health.add_latency("stage", t_pub_ns - cause.t_pub_ns)
+        finally:
+            done = Done(cause.message.seq, cause.message.t_ns, self.stage_name, self.worker)
+            self.outlet.publish(DONE, done, cause.t_origin_ns, stage=self.stage_name)
 
 
 class FlowShell(BatchShell):

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Sequence
-from contextlib import ExitStack
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from threading import Event
 from typing import Any, ClassVar
 
@@ -52,7 +52,7 @@ class WorkerShell:
         self._topics = {t.name: t for t in self.inputs}
         self._counters: dict[str, int] = {}
         self._gaps: dict[str, tuple[str, GapCounter]] = {}  # by key: topic and counter
-        self._heard_s: dict[Topic, float] = {}  # when the last message came
+        self._heard: dict[str, tuple[Topic, float]] = {}  # by key: when the last message came
         self._logged: set[str] = set()
         self._t_ns = 0
 
@@ -105,8 +105,8 @@ class WorkerShell:
         """What is wrong now: the stage's own alarms, and inputs that have fallen silent."""
         now_s = time.monotonic()
         silent = {
-            f"stale.{topic.name}": f"nothing on {key(topic, self.rig)} for {now_s - heard_s:.1f} s"
-            for topic, heard_s in self._heard_s.items()
+            f"stale.{at}": f"nothing for {now_s - heard_s:.1f} s"
+            for at, (topic, heard_s) in self._heard.items()
             if topic.stale_after_s and now_s - heard_s > topic.stale_after_s
         }
         return {**alarms_of(self.stage), **silent}
@@ -160,17 +160,24 @@ class WorkerShell:
             self.received(item.source, envelope)
             return
         self._note_arrival(topic, item.key, envelope.message)
-        try:
+        outputs: Sequence[Message] = []
+        with self._survived(item.key, envelope):
             outputs = self.stage.handle(envelope.message)
-        except Exception as e:  # a worker outlives whatever one message does to its stage
+        with self._survived(item.key, envelope):
+            self.publish(outputs, envelope)
+
+    @contextmanager
+    def _survived(self, at: str, envelope: Envelope) -> Iterator[None]:
+        """A worker outlives whatever one message does to it."""
+        try:
+            yield
+        except Exception as e:
             name = f"error.{type(e).__name__}"
-            self.count(name, f"{name} on {item.key}, seq {envelope.message.seq}", with_trace=True)
-            outputs = []
-        self.publish(outputs, envelope)
+            self.count(name, f"{name} on {at}, seq {envelope.message.seq}", with_trace=True)
 
     def _note_arrival(self, topic: Topic, at: str, message: Any) -> None:
         self.count(f"in.{topic.name}")
-        self._heard_s[topic] = time.monotonic()
+        self._heard[at] = (topic, time.monotonic())
         self._t_ns = max(self._t_ns, message.t_ns)
         if (overtaking := self.inputs[topic]) >= 0:
             if at not in self._gaps:

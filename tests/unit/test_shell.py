@@ -1,0 +1,188 @@
+"""The worker shell over a session of its own: what one bad message or a broken stage does to it."""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Callable, Iterator, Sequence
+from threading import Event, Thread
+from typing import Any
+
+import numpy as np
+import pytest
+import zenoh
+
+from velod.config import Settings, ZenohSettings
+from velod.runtime.outlet import Outlet
+from velod.runtime.roles import SHELLS
+from velod.runtime.session import open_session
+from velod.runtime.shell import WorkerShell
+from velod.types import DepthBatch, Done, EventBatch, FlowBatch, ImuSamples, Message, Velocity
+from velod.wire import Envelope, decode
+from velod.wire.topics import BATCH_FLOW, DEPTH, DONE, FLOW, HEALTH, IMU, VELOCITY, Topic, key
+
+
+class FakeStage:
+    """Answers with what a function says."""
+
+    def __init__(self, answer: Callable[[Any], Sequence[Message]]) -> None:
+        self.counters = {"seen": 0}
+        self.alarms = {"lens": "dirty"}
+        self._answer = answer
+
+    def handle(self, message: Any) -> Sequence[Message]:
+        self.counters["seen"] += 1
+        return self._answer(message)
+
+
+@pytest.fixture
+def session() -> Iterator[zenoh.Session]:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = int(probe.getsockname()[1])
+    with open_session(ZenohSettings(port=port), introducer=True) as opened:
+        yield opened
+
+
+class Bench:
+    """A shell that runs in a thread, and everything that it publishes."""
+
+    def __init__(self, session: zenoh.Session, stage_name: str, stage: FakeStage) -> None:
+        self.shell: WorkerShell = SHELLS[stage_name](session, Settings(), stage_name, f"{stage_name}-0", stage)
+        self.outlet = Outlet(session, "rig0")
+        self.heard: dict[str, list[Envelope]] = {}
+        for topic in (FLOW, DONE, VELOCITY, HEALTH):
+            self._listen(session, topic)
+        self._stop = Event()
+        self._thread = Thread(target=self.shell.run, args=(self._stop,))
+
+    def _listen(self, session: zenoh.Session, topic: Topic) -> None:
+        heard = self.heard.setdefault(topic.name, [])
+        session.declare_subscriber(key(topic, "rig0"), lambda s: heard.append(decode(s.payload.to_bytes())))
+
+    def __enter__(self) -> Bench:
+        self._thread.start()
+        time.sleep(0.1)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join()
+
+    def wait_for(self, topic: Topic, n: int) -> list[Envelope]:
+        deadline_s = time.monotonic() + 5.0
+        while len(self.heard[topic.name]) < n and time.monotonic() < deadline_s:
+            time.sleep(0.01)
+        return self.heard[topic.name]
+
+
+def event_batch(seq: int) -> EventBatch:
+    empty = np.zeros(0, np.uint16)
+    return EventBatch(
+        seq,
+        1000 + seq,
+        0,
+        0,
+        empty,
+        empty,
+        np.zeros(0, np.uint32),
+        np.zeros(0, np.uint8),
+        np.zeros((0, 25), np.uint32),
+    )
+
+
+def flow_batch(seq: int, t_ns: int) -> FlowBatch:
+    f = np.zeros(0, np.float32)
+    return FlowBatch(
+        seq, t_ns, 0, np.zeros(0, np.uint16), np.zeros(0, np.uint32), f, f, np.zeros((0, 2), np.float32), f, f
+    )
+
+
+def depth_batch(seq: int, t_ns: int) -> DepthBatch:
+    f = np.zeros(0, np.float32)
+    return DepthBatch(seq, t_ns, 0, np.zeros(0, np.uint16), f, f, f, np.zeros(0, np.uint8))
+
+
+def velocity(batch_seq: int, batch_t_ns: int) -> Velocity:
+    return Velocity(0, 5000, np.zeros(3), np.eye(3), True, "tracking", "", batch_seq, batch_t_ns)
+
+
+def test_a_worker_answers_with_its_result_and_done_and_passes_the_origin_on(session: zenoh.Session) -> None:
+    with Bench(session, "flow", FakeStage(lambda b: [flow_batch(b.seq, b.t_ns)])) as bench:
+        bench.outlet.publish(BATCH_FLOW, event_batch(7), t_origin_ns=123, worker="flow-0")
+        (done,) = bench.wait_for(DONE, 1)
+        (flow,) = bench.wait_for(FLOW, 1)
+    assert done.message == Done(7, 1007, "flow", "flow-0")
+    assert (flow.message.seq, flow.t_origin_ns) == (7, 123)
+    assert flow.t_pub_ns > 123
+
+
+def test_a_stage_that_raises_is_counted_and_the_batch_is_done_all_the_same(session: zenoh.Session) -> None:
+    def answer(batch: EventBatch) -> Sequence[Message]:
+        if batch.seq == 0:
+            raise ZeroDivisionError("no")
+        return [flow_batch(batch.seq, batch.t_ns)]
+
+    with Bench(session, "flow", FakeStage(answer)) as bench:
+        for seq in (0, 1):
+            bench.outlet.publish(BATCH_FLOW, event_batch(seq), worker="flow-0")
+        assert [d.message.seq for d in bench.wait_for(DONE, 2)] == [0, 1]
+        assert [f.message.seq for f in bench.wait_for(FLOW, 1)] == [1]
+    assert bench.shell.counters()["error.ZeroDivisionError"] == 1
+
+
+def test_a_result_that_cannot_be_encoded_is_counted_and_the_batch_is_done(session: zenoh.Session) -> None:
+    broken = Velocity(0, 0, np.zeros(2), np.eye(3), True, "tracking", "", 0, 0)  # two of three components
+    with Bench(session, "flow", FakeStage(lambda b: [broken])) as bench:
+        bench.outlet.publish(BATCH_FLOW, event_batch(3), worker="flow-0")
+        assert [d.message.seq for d in bench.wait_for(DONE, 1)] == [3]
+    assert sum(n for name, n in bench.shell.counters().items() if name.startswith("error.")) == 1
+
+
+def test_garbage_is_counted_by_reason_and_does_not_reach_the_stage(session: zenoh.Session) -> None:
+    stage = FakeStage(lambda b: [])
+    with Bench(session, "flow", stage) as bench:
+        session.put(key(BATCH_FLOW, "rig0", worker="flow-0"), b"garbage")
+        bench.outlet.publish(BATCH_FLOW, event_batch(0), worker="flow-0")
+        bench.wait_for(DONE, 1)
+    assert stage.counters == {"seen": 1}
+    assert sum(n for name, n in bench.shell.counters().items() if name.startswith("wire.")) == 1
+
+
+def test_a_velocity_carries_the_origin_of_the_batch_it_used(session: zenoh.Session) -> None:
+    def answer(message: Message) -> Sequence[Message]:
+        return [velocity(1, 1001)] if isinstance(message, ImuSamples) else []
+
+    with Bench(session, "optimizer", FakeStage(answer)) as bench:
+        for seq in (0, 1, 2):
+            bench.outlet.publish(FLOW, flow_batch(seq, 1000 + seq), t_origin_ns=100 + seq)
+            bench.outlet.publish(DEPTH, depth_batch(seq, 1000 + seq), t_origin_ns=100 + seq)
+        time.sleep(0.2)
+        nothing = np.zeros((0, 3))
+        bench.outlet.publish(IMU, ImuSamples(0, 0, 0, 2, 1002, np.zeros(0, np.int64), nothing, nothing))
+        (out,) = bench.wait_for(VELOCITY, 1)
+    assert out.t_origin_ns == 101
+
+
+def test_health_tells_counters_gaps_rates_and_alarms(session: zenoh.Session) -> None:
+    with Bench(session, "optimizer", FakeStage(lambda m: [])) as bench:
+        for seq in (0, 1, 5):
+            nothing = np.zeros((0, 3))
+            bench.outlet.publish(IMU, ImuSamples(seq, 77, 0, -1, 0, np.zeros(0, np.int64), nothing, nothing))
+        first, *_ = bench.wait_for(HEALTH, 1)
+    health = first.message
+    assert (health.stage, health.worker, health.t_ns) == ("optimizer", "optimizer-0", 77)
+    assert health.counters["seen"] == health.counters["in.imu"] == 3
+    assert health.counters["gap.imu"] == 3
+    assert health.rates["in.imu"] == pytest.approx(3.0, rel=0.2)
+    assert health.alarms["lens"] == "dirty"
+
+
+def test_silence_of_one_publisher_is_an_alarm(session: zenoh.Session) -> None:
+    with Bench(session, "optimizer", FakeStage(lambda m: [])) as bench:
+        bench.outlet.publish(FLOW, flow_batch(0, 1))
+        bench.outlet.publish(DEPTH, depth_batch(0, 1))
+        time.sleep(0.7)
+        bench.outlet.publish(DEPTH, depth_batch(1, 2))
+        time.sleep(0.1)
+        assert [name for name in bench.shell.alarms() if name.startswith("stale")] == ["stale.velod/rig0/flow"]
