@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -45,6 +46,22 @@ def test_eval_through_the_processes_knows_the_latency(slanted: Path, settings_fi
     result = json.loads(out.read_text())
     assert result["ave_mps"] < 0.5 and result["valid_fraction"] > 0.9 and result["real_time_factor"] > 0.0
     assert 0.0 < result["latency_p50_ms"] <= result["latency_p99_ms"]
+
+
+def test_the_demo_ends_with_its_error_against_the_truth(
+    simulated: Callable[[str, float], Path],
+    settings_file: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setenv("VELOD_CACHE_DIR", str(simulated("boxes-4", 0.6).parents[1]))
+    out = tmp_path / "out.json"
+    argv = ["demo", "--seconds", "0.6", "--sequence", "boxes-4", "-c", str(settings_file), "--json", str(out)]
+    assert main(argv) == 0
+    assert json.loads(out.read_text())["ave_mps"] < 0.25
+    shown = capsys.readouterr().out
+    assert all(word in shown for word in ("AVE", "RVE", "rate", "latency"))
 
 
 def test_a_port_that_is_taken_is_one_clear_line(slanted: Path, tmp_path: Path) -> None:
