@@ -18,6 +18,7 @@ import zenoh
 
 RIG = "rig0"
 PERIOD_NS = 5_000_000  # a packet every 5 ms of sensor time
+NOISE = np.random.default_rng(1)
 
 
 def event_packet(seq, watermark_ns, camera, t_ns, x, y, p):
@@ -69,7 +70,9 @@ def read_camera(camera, start_ns, end_ns):
 
 def read_imu(start_ns):
     """Stands for your SDK: one sample of a camera that lies level and still (y points down)."""
-    return np.array([start_ns]), np.array([[0.0, -9.81, 0.0]]), np.zeros((1, 3))
+    # Noise, as any real IMU has: velod takes one that repeats itself for frozen.
+    accel, gyro = NOISE.normal(0.0, 0.02, (2, 1, 3))
+    return np.array([start_ns]), accel + [0.0, -9.81, 0.0], gyro
 
 
 def main():
