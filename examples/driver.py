@@ -72,7 +72,7 @@ def read_imu(start_ns):
     """Stands for your SDK: one sample of a camera that lies level and still (y points down)."""
     # Noise, as any real IMU has: velod takes one that repeats itself for frozen.
     accel, gyro = NOISE.normal(0.0, 0.02, (2, 1, 3))
-    return np.array([start_ns]), accel + [0.0, -9.81, 0.0], gyro
+    return np.array([start_ns]), accel + np.array([0.0, -9.81, 0.0]), gyro
 
 
 def main():
