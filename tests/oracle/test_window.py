@@ -40,6 +40,89 @@ def test_marginalisation_equals_the_full_batch_solution():
     assert np.abs((P - Q) / np.sqrt(np.outer(np.diag(P), np.diag(P)))).max() < 1e-4
 
 
+def dense(window):
+    """A copy of the information matrix and vector."""
+    n = window.size
+    return window._H[:n, :n].copy(), window._h[:n].copy()
+
+
+@pytest.mark.parametrize("segments", [4, 11])
+def test_the_solution_in_the_envelope_is_that_of_dense_algebra(segments):
+    rng = np.random.default_rng(3)
+    w = filled(segments, rng)
+    H, h = dense(w)
+    J, r, root = rng.normal(size=(3, w.size)), rng.normal(size=3), rng.normal(size=(3, 3))
+    J[:, : w.size - 60] = 0.0
+    g, information = np.array([1.0, -9.0, 3.0]), root @ root.T + np.eye(3)
+    solution = w.solve([(J, r, information)], g, 0.01)
+    H += J.T @ information @ J
+    h += J.T @ information @ r
+    direction, sigma = g / np.linalg.norm(g), 0.02 + 9.81 * 0.01**2
+    H[-3:, -3:] += np.outer(direction, direction) / sigma**2
+    h[-3:] += direction * 9.81 / sigma**2
+    P = np.linalg.inv(H)
+    assert np.abs((solution.x - P @ h) / np.sqrt(np.diag(P))).max() < 1e-5
+    F = w.selector(int((w.last + 0.6) * KNOT_NS))
+    Q = F @ P @ F.T
+    assert np.abs((solution.cov(F) - Q) / np.sqrt(np.outer(np.diag(Q), np.diag(Q)))).max() < 1e-5
+
+
+def test_an_information_that_determines_nothing_is_refused():
+    w = filled(4, np.random.default_rng(1))
+    w._H[:] = 0.0
+    with pytest.raises(np.linalg.LinAlgError):
+        w.solve([], None, 0.0)
+
+
+def test_what_leaves_the_window_is_a_schur_complement():
+    w = filled(4, np.random.default_rng(6))
+    H, h = dense(w)
+    gone = np.r_[0:3, HEAD + 3 : HEAD + 12]
+    kept = np.setdiff1d(np.arange(w.size), gone)
+    gain = np.linalg.solve(H[np.ix_(gone, gone)], np.column_stack([H[np.ix_(gone, kept)], h[gone]]))
+    w._marginalise_oldest()
+    m = len(kept)
+    assert w.first == 9
+    assert np.allclose(w._H[:m, :m], H[np.ix_(kept, kept)] - H[np.ix_(kept, gone)] @ gain[:, :-1], atol=1e-6)
+    assert np.allclose(w._h[:m], h[kept] - H[np.ix_(kept, gone)] @ gain[:, -1], atol=1e-6)
+    assert not w._H[m:].any() and not w._H[:, m:].any()
+
+
+def test_a_factor_adds_its_normal_equations():
+    rng = np.random.default_rng(9)
+    w = filled(4, rng)
+    H, h = dense(w)
+    J, r, root = (
+        rng.normal(size=(3, w.size)) * (rng.random(w.size) < 0.3),
+        rng.normal(size=3),
+        rng.normal(size=(3, 3)),
+    )
+    information = root @ root.T
+    w.add(J, r, information)
+    assert np.allclose(dense(w)[0], H + J.T @ information @ J)
+    assert np.allclose(dense(w)[1], h + J.T @ information @ r)
+
+
+def test_information_of_a_moment_is_spread_by_the_spline():
+    rng = np.random.default_rng(9)
+    w = filled(4, rng)
+    H, h = dense(w)
+    root, eta, t = rng.normal(size=(6, 6)), rng.normal(size=6), int(9.3 * KNOT_NS)
+    L = root @ root.T
+    w.add_information(t, L, eta)
+    spread = w.selector(t)[[0, 1, 2, 6, 7, 8]]
+    assert np.allclose(dense(w)[0], H + spread.T @ L @ spread)
+    assert np.allclose(dense(w)[1], h + spread.T @ eta)
+
+
+def test_blocks_between_two_moments_are_spread_over_their_control_points():
+    w = filled(4, np.random.default_rng(9))
+    blocks = np.random.default_rng(1).normal(size=(3, 15))
+    t_i, t_j = int(9.95 * KNOT_NS), int(10.2 * KNOT_NS)
+    twin = blocks[:, :12] @ w.selector(t_i) + blocks[:, 12:] @ w.spline_row(t_j)
+    assert np.allclose(w.between(t_i, t_j, blocks), twin, atol=1e-15)
+
+
 def test_the_window_keeps_its_size():
     w = filled(4, np.random.default_rng(1))
     assert (w.first, w.last) == (8, 11)
@@ -115,6 +198,22 @@ def test_the_inertial_factor_is_the_derivative_of_the_residual(estimator):
         numeric = (residual(e, x + d, t_i, t_j) - residual(e, x - d, t_i, t_j)) / (2 * h)
         assert np.allclose(J[:, column], numeric, atol=1e-6), column
     assert np.all(np.linalg.eigvalsh(information) > 0)
+
+
+def test_the_factors_information_is_that_of_the_imus_noise(estimator):
+    e, (t_i, t_j) = estimator, (255_000_000, 280_000_000)
+    _, _, information = e._inertial_factor(t_i, t_j)
+    p, (v_j, _) = e._preintegrate(t_i, t_j, e.head.b_a, e.head.b_w), e.predict(t_j)
+    G = np.hstack([p.R_gamma @ hat(v_j), np.eye(3)])
+    assert np.allclose(information, np.linalg.inv(G @ p.cov @ G.T + np.eye(3) * 1e-6), rtol=1e-9)
+
+
+def test_the_velocity_is_carried_by_eq_10(estimator):
+    e, t = estimator, 290_000_000
+    head = e.head
+    p = e._preintegrate(head.t_ns, t, head.b_a, head.b_w)
+    v, _ = e.predict(t)
+    assert np.allclose(v, p.R_gamma.T @ (p.beta + head.v_B - head.R_LB.T @ head.g_L * p.dt), atol=1e-13)
 
 
 def test_the_inertial_residual_closes_on_the_true_motion():

@@ -2,8 +2,9 @@
 
 import numpy as np
 
+from velod.geometry.camera import motion_field_rows
 from velod.geometry.so3 import exp
-from velod.optimizer.flow_equation import Rows, body_rows, compress, sigmas, solve
+from velod.optimizer.flow_equation import Rows, body_rows, compress, on_error, on_velocity, pairs, sigmas, solve
 
 
 def rows_of(v, b_w, rng, m=200, outliers=0.0, sigma=2.0):
@@ -103,3 +104,38 @@ def test_the_depths_sigma_counts_with_the_translational_flow():
     far = sigmas(one, np.array([0.5], f4), np.array([0.05], f4), np.array([0.0]))
     near = sigmas(one, np.array([0.5], f4), np.array([0.05], f4), np.array([100.0]))
     assert np.isclose(near[0] ** 2 - far[0] ** 2, 10.0**2, rtol=1e-5)
+
+
+def test_pairs_are_the_intersection_of_both_indices():
+    rng = np.random.default_rng(3)
+    a, b = (np.sort(rng.choice(500, n, replace=False)).astype(np.uint16) for n in (300, 220))
+    _, at_a, at_b = np.intersect1d(a, b, assume_unique=True, return_indices=True)
+    i, j = pairs(a, b)
+    assert np.array_equal(i, at_a) and np.array_equal(j, at_b)
+    assert [len(k) for k in pairs(a, b[:0])] == [0, 0]
+
+
+def test_rows_in_the_body_frame_are_those_of_plain_matrix_algebra():
+    rng = np.random.default_rng(5)
+    m, f4, camera = 50, np.float32, (230.0, 170.0, 130.0)
+    xy, inv_depth = rng.uniform(0, 300, (2, m)).astype(f4), rng.uniform(0.1, 1.0, m).astype(f4)
+    angle = rng.uniform(0, 2 * np.pi, m)
+    n = np.column_stack([np.cos(angle), np.sin(angle)]).astype(f4)
+    R_CB, p_BC_B = exp(rng.normal(size=3)), rng.normal(size=3)
+    a, b = body_rows((xy[0], xy[1]), n, inv_depth, camera, R_CB, p_BC_B)
+    nA, nB = motion_field_rows(xy[0], xy[1], *camera, n)
+    assert np.allclose(a, inv_depth[:, None] * nA @ R_CB, rtol=1e-6, atol=1e-9)
+    assert np.allclose(b, nB @ R_CB + np.cross(p_BC_B, a), rtol=1e-6, atol=1e-9)
+
+
+def test_rows_on_the_error_of_the_integrated_velocity_say_the_same():
+    """v_B = R_BL (s_L + e) put into the rows on v_B."""
+    rng = np.random.default_rng(6)
+    m = 40
+    a_B, b_B, w_B, s_L, e = rng.normal(size=(5, m, 3))
+    R_LB, speed = exp(rng.normal(size=(m, 3))), rng.uniform(1, 100, m)
+    rows = on_velocity(np.arange(m), speed, a_B, b_B, w_B)
+    assert np.allclose(rows.z, speed - np.sum(b_B * w_B, axis=1))
+    error = on_error(rows, R_LB, s_L)
+    v_B = np.einsum("kji,kj->ki", R_LB, s_L + e)
+    assert np.allclose(error.z - np.sum(error.a * e, axis=1), rows.z - np.sum(a_B * v_B, axis=1))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,8 +10,7 @@ import numpy as np
 from velod.config import Settings
 from velod.geometry.calibration import Calibration
 from velod.geometry.rectify import rectify
-from velod.geometry.so3 import hat
-from velod.optimizer import flow_equation
+from velod.optimizer import flow_equation, inertial_residual
 from velod.optimizer.flow_equation import Fit, Rows
 from velod.optimizer.inertial import InertialMemory
 from velod.optimizer.preintegration import Preintegration, preintegrate
@@ -21,10 +21,10 @@ BIN_NS = 5_000_000
 """Flows this close in time share one gyroscope noise (DESIGN 5, item 6)."""
 SMOOTHNESS = {"error": 0.5, "velocity": 5.0}
 """Weak sigma of the second difference of control points, m/s, by what the spline models."""
-IMU_MODEL_SIGMA = 1e-3
-"""What sampling leaves undetermined of one preintegration interval, m/s."""
 INNOVATION_GATE = 25.0
 """Squared Mahalanobis distance from which a batch that contradicts the prediction loses weight (5 sigma)."""
+MAX_CARRIED = 32
+"""Predictions of one head that are remembered: a batch asks for some of them twice."""
 MAX_DIRECTION_SIGMA = 0.5
 """rad; gravity's direction must be known this well before its norm says anything."""
 
@@ -44,9 +44,10 @@ class Head:
     @property
     def gravity_direction_sigma(self) -> float:
         """Standard deviation of the direction of g_L, rad."""
-        n = self.g_L / np.linalg.norm(self.g_L)
-        across = np.eye(3) - np.outer(n, n)
-        return float(np.sqrt(np.trace(across @ self.cov[9:, 9:] @ across)) / np.linalg.norm(self.g_L))
+        norm = float(np.linalg.norm(self.g_L))
+        n, cov = self.g_L / norm, self.cov[9:, 9:]
+        # the trace of the covariance across n
+        return math.sqrt(max(float(np.trace(cov) - n @ cov @ n), 0.0)) / norm
 
 
 class Estimator:
@@ -72,6 +73,8 @@ class Estimator:
         self.batches = 0  # that gave a velocity
         self.last_usable_t_ns = 0
         self._preintegrated_to = 0
+        self._carried: dict[int, tuple[F64, F64]] = {}  # t_ns -> prediction, from the head ``_carried_from``
+        self._carried_from: Head | None = None
 
     def add_imu(self, samples: ImuSamples) -> None:
         """Remember IMU samples."""
@@ -101,21 +104,14 @@ class Estimator:
         head = self.head
         if head is None or not self.memory.covers(head.t_ns, t_ns):
             return None
-        p = self._preintegrate(head.t_ns, t_ns, head.b_a, head.b_w)
-        R_T = p.R_gamma.T
-        g_B = head.R_LB.T @ head.g_L
-        # Eq. 10 (with beta rotated by R_WB_i) in the frame B_j
-        v = R_T @ (p.beta + head.v_B - g_B * p.dt)
-        J = np.hstack(
-            [
-                R_T,
-                R_T @ p.d_beta_d_ba,
-                R_T @ p.d_beta_d_bw + hat(v) @ p.d_theta_d_bw,
-                -R_T @ head.R_LB.T * p.dt,
-            ]
-        )
-        N = np.hstack([hat(v), R_T])
-        return v, J @ head.cov @ J.T + N @ p.cov @ N.T
+        if self._carried_from is not head or len(self._carried) >= MAX_CARRIED:
+            self._carried_from = head
+            self._carried.clear()
+        if t_ns not in self._carried:
+            p = self._preintegrate(head.t_ns, t_ns, head.b_a, head.b_w)
+            self._carried[t_ns] = inertial_residual.carry(p, head.v_B, head.R_LB, head.g_L, head.cov)
+        v, cov = self._carried[t_ns]
+        return v.copy(), cov.copy()
 
     def _biases(self) -> tuple[F64, F64]:
         return (np.zeros(3), np.zeros(3)) if self.head is None else (self.head.b_a, self.head.b_w)
@@ -132,7 +128,8 @@ class Estimator:
         R, s, _ = self.memory.at(np.array([t_ns]))
         if self._o.spline == "velocity":
             return R[0], np.zeros(3), np.eye(3)
-        return R[0], R[0].T @ s[0], R[0].T
+        M = np.ascontiguousarray(R[0].T)
+        return R[0], M @ s[0], M
 
     def _rows(self, flow: FlowBatch, depth: DepthBatch) -> tuple[Rows, Rows] | None:
         """Rows of the flow equation where flow and depth speak of the same event: on the spline, and on e."""
@@ -195,23 +192,13 @@ class Estimator:
 
     def _inertial_factor(self, t_i: int, t_j: int) -> tuple[F64, F64, F64]:
         """(J, r, information) of Eq. 14's inertial residual over [t_i, t_j], in the frame B_i."""
-        b_a, b_w = self._biases()
-        p = self._preintegrate(t_i, t_j, b_a, b_w)
+        p = self._preintegrate(t_i, t_j, *self._biases())
         R_LBi, N_i, M_i = self._frame(t_i)
         _, N_j, M_j = self._frame(t_j)
         predicted = self.predict(t_j) if self.head is not None and t_j >= self.head.t_ns else None
         v_j = predicted[0] if predicted is not None else (np.zeros(3) if self.head is None else self.head.v_B)
-        J_bw = p.d_beta_d_bw + p.R_gamma @ hat(v_j) @ p.d_theta_d_bw
-        w = self.window
-        F_i = w.selector(t_i)
-        # Eq. 14: beta(b) - R(gamma(b)) v_j - g_B dt + v_i = 0
-        J = M_i @ F_i[:3] - p.R_gamma @ M_j @ w.spline_row(t_j)
-        J += p.d_beta_d_ba @ F_i[3:6] + J_bw @ F_i[6:9] - R_LBi.T @ F_i[9:12] * p.dt
-        r = p.d_beta_d_ba @ b_a + J_bw @ b_w - p.beta + p.R_gamma @ N_j - N_i
-        # the gyroscope's noise enters through R(gamma) v too, which Eq. 9 alone omits
-        G = np.hstack([p.R_gamma @ hat(v_j), np.eye(3)])
-        cov = G @ p.cov @ G.T + np.eye(3) * IMU_MODEL_SIGMA**2
-        return J, r, np.asarray(np.linalg.inv(cov))
+        blocks, r, information = inertial_residual.linearise(p, R_LBi, (N_i, M_i), (N_j, M_j), v_j)
+        return self.window.between(t_i, t_j, blocks), r, information
 
     def _add_flow(self, t_ns: int, rows: Rows, on_error: Rows, predicted: tuple[F64, F64] | None) -> None:
         fit = self._fit(t_ns, on_error)
@@ -241,8 +228,8 @@ class Estimator:
         if t_ns > self._preintegrated_to:
             extra.append(self._inertial_factor(self._preintegrated_to, t_ns))
         g_prior, g_sigma = None, 0.0
-        if self.head is not None and self.head.gravity_direction_sigma < MAX_DIRECTION_SIGMA:
-            g_prior, g_sigma = self.head.g_L, self.head.gravity_direction_sigma
+        if self.head is not None and (sigma := self.head.gravity_direction_sigma) < MAX_DIRECTION_SIGMA:
+            g_prior, g_sigma = self.head.g_L, sigma
         solution = self.window.solve(extra, g_prior, g_sigma)
         F = self.window.selector(t_ns)
         R_LB, N, M = self._frame(t_ns)

@@ -124,7 +124,12 @@ def compress(rows: Rows, fit: Fit, bin_ns: int, gyro_noise: float, shared_error:
     """
     first = int(rows.t_ns.min()) // bin_ns
     count = int(rows.t_ns.max()) // bin_ns - first + 1
-    L, eta, total, t_ns = np.zeros((count, 6, 6)), np.zeros((count, 6)), np.zeros((count, 2)), np.empty(count, np.int64)
+    L, eta, total, t_ns = (
+        np.zeros((count, 6, 6)),
+        np.zeros((count, 6)),
+        np.zeros((count, 2)),
+        np.empty(count, np.int64),
+    )
     noise_information = bin_ns * 1e-9 / gyro_noise**2
     _compress(
         rows.t_ns, rows.z, rows.a, rows.b, rows.sigma, fit.weight, fit.scale**2 * shared_error,

@@ -110,7 +110,9 @@ def _nominal_step(a0, a1, w0, w1, b, dt, R, s, phi, E, M):  # type: ignore[no-un
         for i in range(3):
             for j in range(3):
                 M[i, j] = R[i, 0] * E[0, j] + R[i, 1] * E[1, j] + R[i, 2] * E[2, j]
-        R[:, :] = M
+        for i in range(3):
+            for j in range(3):
+                R[i, j] = M[i, j]
         weight = dt * 4.0 / 6.0 if half == 0 else dt / 6.0
         r = 0.5 if half == 0 else 1.0
         for i in range(3):
@@ -130,15 +132,23 @@ def _integrate_nominal(t_ns, accel, gyro, bias, R_out, s_out, first, last):  # t
 
 @njit(cache=True, nogil=True)
 def _nominal_at(t_ns, accel, gyro, bias, R_at, s_at, t_query, R_out, s_out, w_out):  # type: ignore[no-untyped-def]
-    phi, E, M = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
-    a1, w1 = np.empty(3), np.empty(3)
+    # Scratch instead of views of the rows: a view costs more than the arithmetic.
+    phi, E, M, R, s = np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
+    a0, w0, a1, w1, b = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(6)
     for m in range(len(t_query)):
         k = np.searchsorted(t_ns, t_query[m], side="right") - 1
         k = min(max(k, 0), len(t_ns) - 2)
         share = (t_query[m] - t_ns[k]) / (t_ns[k + 1] - t_ns[k])
         for i in range(3):
-            a1[i] = accel[k, i] + share * (accel[k + 1, i] - accel[k, i])
-            w1[i] = gyro[k, i] + share * (gyro[k + 1, i] - gyro[k, i])
-        R_out[m], s_out[m], w_out[m] = R_at[k], s_at[k], w1
+            a0[i], w0[i], s[i] = accel[k, i], gyro[k, i], s_at[k, i]
+            a1[i] = a0[i] + share * (accel[k + 1, i] - a0[i])
+            w1[i] = w0[i] + share * (gyro[k + 1, i] - w0[i])
+            b[i], b[3 + i] = bias[k, i], bias[k, 3 + i]
+            for j in range(3):
+                R[i, j] = R_at[k, i, j]
         dt = (t_query[m] - t_ns[k]) * 1e-9
-        _nominal_step(accel[k], a1, gyro[k], w1, bias[k], dt, R_out[m], s_out[m], phi, E, M)
+        _nominal_step(a0, a1, w0, w1, b, dt, R, s, phi, E, M)
+        for i in range(3):
+            s_out[m, i], w_out[m, i] = s[i], w1[i]
+            for j in range(3):
+                R_out[m, i, j] = R[i, j]

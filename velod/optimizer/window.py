@@ -150,6 +150,15 @@ class Window:
         for column, weight in zip(self.control_columns(segment), weights.tolist(), strict=True):
             F[0, column] = F[1, column + 1] = F[2, column + 2] = weight
 
+    def between(self, t_i: int, t_j: int, blocks: F64) -> F64:
+        """J (r, n) with J x = blocks [spline(t_i), b_a, b_w, g_L, spline(t_j)], the middle of t_i's segment."""
+        J = np.zeros((len(blocks), self.size))
+        (at_i, u_i), (at_j, u_j) = locate(t_i, self._knot_ns), locate(t_j, self._knot_ns)
+        columns = np.array([*self.control_columns(at_i), *self.control_columns(at_j)])
+        own = HEAD + BLOCK * (at_i - self.first) + 3
+        _place(columns, np.concatenate((basis(u_i), basis(u_j))), own, blocks, J)
+        return J
+
     def add(self, J: F64, r: F64, information: F64) -> None:
         """A factor (J x - r)^T information (J x - r)."""
         _add_factor(self._H, self._h, self._end, J, r, information)
@@ -211,6 +220,18 @@ class Window:
         H[m:], H[:, m:], h[m:] = 0.0, 0.0, 0.0
         end[m:] = np.arange(m + 1, len(end) + 1)
         self.first += 1
+
+
+@njit(cache=True, nogil=True)
+def _place(columns: I64, weights: F64, own: int, blocks: F64, J: F64) -> None:
+    """Spread the blocks of two splines (r, 15) over their control points; the rest begins at column ``own``."""
+    for p in range(len(J)):
+        for j in range(9):
+            J[p, own + j] = blocks[p, 3 + j]
+        for a in range(8):
+            block = 0 if a < 4 else 12
+            for j in range(3):
+                J[p, columns[a] + j] += weights[a] * blocks[p, block + j]
 
 
 @njit(cache=True, nogil=True)

@@ -1,0 +1,175 @@
+"""The IMU between two moments: the velocity carried on (Eq. 10) and the inertial residual of Eq. 14, linearised."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from velod.optimizer.preintegration import Preintegration
+from velod.types import F64
+
+IMU_MODEL_SIGMA = 1e-3
+"""What sampling leaves undetermined of one preintegration interval, m/s."""
+
+
+def carry(p: Preintegration, v_B: F64, R_LB: F64, g_L: F64, cov: F64) -> tuple[F64, F64]:
+    """v_B (3,) and its covariance (3, 3) at the end of ``p`` from [v_B, b_a, b_w, g_L] and cov (12, 12) before."""
+    v, out = np.empty(3), np.empty((3, 3))
+    _carry(
+        p.R_gamma, p.beta, p.d_theta_d_bw, p.d_beta_d_ba, p.d_beta_d_bw, p.cov, p.dt, v_B, R_LB, g_L, cov, v, out
+    )  # fmt: skip
+    return v, out
+
+
+def linearise(
+    p: Preintegration, R_LBi: F64, from_i: tuple[F64, F64], from_j: tuple[F64, F64], v_j: F64
+) -> tuple[F64, F64, F64]:
+    """Blocks (3, 15), r (3,) and information (3, 3) of the residual blocks x - r, in the frame B_i.
+
+    x = [spline(t_i), b_a, b_w, g_L, spline(t_j)]; ``from_i`` and ``from_j`` are (N, M) of v_B = N + M spline, and
+    ``v_j`` is the velocity at t_j at which the residual is linearised.
+    """
+    blocks, r, information = np.empty((3, 15)), np.empty(3), np.empty((3, 3))
+    _linearise(
+        p.R_gamma, p.beta, p.d_theta_d_bw, p.d_beta_d_ba, p.d_beta_d_bw, p.cov, p.dt, p.b_a, p.b_w,
+        R_LBi, from_i[0], from_i[1], from_j[0], from_j[1], v_j, blocks, r, information,
+    )  # fmt: skip
+    return blocks, r, information
+
+
+@njit(cache=True, nogil=True)
+def _multiply(a: F64, b: F64, out: F64) -> None:
+    """out = a b."""
+    for i in range(a.shape[0]):
+        for j in range(b.shape[1]):
+            s = 0.0
+            for k in range(b.shape[0]):
+                s += a[i, k] * b[k, j]
+            out[i, j] = s
+
+
+@njit(cache=True, nogil=True)
+def _multiply_hat(a: F64, v: F64, out: F64) -> None:
+    """out = a [v]x."""
+    for i in range(3):
+        out[i, 0] = a[i, 1] * v[2] - a[i, 2] * v[1]
+        out[i, 1] = a[i, 2] * v[0] - a[i, 0] * v[2]
+        out[i, 2] = a[i, 0] * v[1] - a[i, 1] * v[0]
+
+
+@njit(cache=True, nogil=True)
+def _add_sandwich(J: F64, P: F64, out: F64) -> None:
+    """out += J P J^T, for J (3, n)."""
+    n = J.shape[1]
+    for i in range(3):
+        for k in range(n):
+            s = 0.0
+            for m in range(n):
+                s += J[i, m] * P[m, k]
+            for j in range(3):
+                out[i, j] += s * J[j, k]
+
+
+@njit(cache=True, nogil=True)
+def _carry(
+    R_gamma: F64,
+    beta: F64,
+    d_theta_d_bw: F64,
+    d_beta_d_ba: F64,
+    d_beta_d_bw: F64,
+    cov_imu: F64,
+    dt: float,
+    v_i: F64,
+    R_LB: F64,
+    g_L: F64,
+    cov: F64,
+    v: F64,
+    out: F64,
+) -> None:
+    J, N, R_T, hat_v, block = (
+        np.empty((3, 12)),
+        np.empty((3, 6)),
+        np.empty((3, 3)),
+        np.empty((3, 3)),
+        np.empty((3, 3)),
+    )
+    for i in range(3):
+        v[i] = 0.0
+        for k in range(3):
+            R_T[i, k] = R_gamma[k, i]
+            g_B = R_LB[0, k] * g_L[0] + R_LB[1, k] * g_L[1] + R_LB[2, k] * g_L[2]
+            # Eq. 10 (with beta rotated by R_WB_i) in the frame B_j
+            v[i] += R_T[i, k] * (beta[k] + v_i[k] - g_B * dt)
+    _multiply_hat(np.eye(3), v, hat_v)
+    J[:, :3] = R_T
+    _multiply(R_T, d_beta_d_ba, block)
+    J[:, 3:6] = block
+    _multiply(R_T, d_beta_d_bw, block)
+    J[:, 6:9] = block
+    _multiply(hat_v, d_theta_d_bw, block)
+    J[:, 6:9] += block
+    _multiply(R_LB, R_gamma, block)
+    J[:, 9:] = -dt * block.T
+    N[:, :3], N[:, 3:] = hat_v, R_T
+    out[:, :] = 0.0
+    _add_sandwich(J, cov, out)
+    _add_sandwich(N, cov_imu, out)
+
+
+@njit(cache=True, nogil=True)
+def _linearise(
+    R_gamma: F64,
+    beta: F64,
+    d_theta_d_bw: F64,
+    d_beta_d_ba: F64,
+    d_beta_d_bw: F64,
+    cov_imu: F64,
+    dt: float,
+    b_a: F64,
+    b_w: F64,
+    R_LBi: F64,
+    N_i: F64,
+    M_i: F64,
+    N_j: F64,
+    M_j: F64,
+    v_j: F64,
+    blocks: F64,
+    r: F64,
+    information: F64,
+) -> None:
+    G, turned, block, cov = np.zeros((3, 6)), np.empty((3, 3)), np.empty((3, 3)), np.zeros((3, 3))
+    _multiply_hat(R_gamma, v_j, turned)
+    # Eq. 14: beta(b) - R(gamma(b)) v_j - g_B dt + v_i = 0
+    blocks[:, :3] = M_i
+    blocks[:, 3:6] = d_beta_d_ba
+    _multiply(turned, d_theta_d_bw, block)
+    blocks[:, 6:9] = d_beta_d_bw + block
+    blocks[:, 9:12] = -dt * R_LBi.T
+    _multiply(R_gamma, M_j, block)
+    blocks[:, 12:] = -block
+    for i in range(3):
+        r[i] = -beta[i] - N_i[i]
+        for k in range(3):
+            r[i] += blocks[i, 3 + k] * b_a[k] + blocks[i, 6 + k] * b_w[k] + R_gamma[i, k] * N_j[k]
+        # the gyroscope's noise enters through R(gamma) v too, which Eq. 9 alone omits
+        G[i, :3] = turned[i]
+        G[i, 3 + i] = 1.0
+        cov[i, i] = IMU_MODEL_SIGMA**2
+    _add_sandwich(G, cov_imu, cov)
+    _invert(cov, information)
+
+
+@njit(cache=True, nogil=True)
+def _invert(a: F64, out: F64) -> None:
+    """out = a^-1 for symmetric, positive definite a (3, 3), by cofactors."""
+    out[0, 0] = a[1, 1] * a[2, 2] - a[1, 2] * a[2, 1]
+    out[0, 1] = a[0, 2] * a[2, 1] - a[0, 1] * a[2, 2]
+    out[0, 2] = a[0, 1] * a[1, 2] - a[0, 2] * a[1, 1]
+    out[1, 1] = a[0, 0] * a[2, 2] - a[0, 2] * a[2, 0]
+    out[1, 2] = a[0, 2] * a[1, 0] - a[0, 0] * a[1, 2]
+    out[2, 2] = a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]
+    det = a[0, 0] * out[0, 0] + a[0, 1] * out[0, 1] + a[0, 2] * out[0, 2]
+    for i in range(3):
+        for j in range(i, 3):
+            out[i, j] /= det
+            out[j, i] = out[i, j]
