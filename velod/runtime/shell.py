@@ -31,6 +31,8 @@ POLL_S = 0.1
 """How long the main thread sleeps at the most before it looks at signals and at the clock."""
 FIFO_DEPTH = 4096
 """Ingest and the optimizer must lose nothing inside: seconds of any driver's packets."""
+BEHIND = 100
+"""So many waiting messages mean that the worker cannot keep up."""
 CONSUMER_WAIT_S = 2.0
 
 
@@ -102,14 +104,15 @@ class WorkerShell:
         return {**self.stage.counters, **self.inbox.counters, **self.outlet.counters, **self._counters, **gaps}
 
     def alarms(self) -> dict[str, str]:
-        """What is wrong now: the stage's own alarms, and inputs that have fallen silent."""
+        """What is wrong now: the stage's own alarms, inputs that have fallen silent, and falling behind."""
         now_s = time.monotonic()
         silent = {
             f"stale.{at}": f"nothing for {now_s - heard_s:.1f} s"
             for at, (topic, heard_s) in self._heard.items()
             if topic.stale_after_s and now_s - heard_s > topic.stale_after_s
         }
-        return {**alarms_of(self.stage), **silent}
+        behind = {} if (n := self.inbox.waiting()) < BEHIND else {"inbox.behind": f"{n} messages wait to be handled"}
+        return {**alarms_of(self.stage), **silent, **behind}
 
     def every_second(self) -> None:
         """Publish the health of the period that ends."""
