@@ -8,12 +8,13 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from velod.config import Settings, ZenohSettings
+from velod.config import FlowSettings, Settings, ZenohSettings
 from velod.io import open_recording
 from velod.runtime.online import OnlineResult, run_online
 from velod.runtime.player import player_command
@@ -159,6 +160,37 @@ def test_garbage_and_alien_versions_are_counted_and_the_service_goes_on(slanted:
     assert longest_gap_s(result) <= 0.1
 
 
+def test_a_worker_that_hangs_is_passed_over_and_loses_no_batch(slanted: Path, settings: Settings) -> None:
+    two = replace(settings, flow=FlowSettings(workers=2))
+    begun: list[float] = []
+    hang, wake = Disturbance(begun, after_s=1.0), Disturbance(begun, after_s=3.5)
+    seqs: set[int] = set()
+
+    def on_step(supervisor: Supervisor) -> None:
+        pid = supervisor.process_ids()["flow-0"]
+        if hang.is_due():
+            os.kill(pid, signal.SIGSTOP)
+        if wake.is_due():
+            os.kill(pid, signal.SIGCONT)
+
+    result = run_online(
+        two,
+        open_recording(slanted).calibration,
+        player_command(str(slanted), two.zenoh, two.rig.name),
+        on_velocity=lambda _: None if begun else begun.append(time.monotonic()),
+        on_message=lambda m: seqs.add(m.seq),
+        topics=(FLOW,),
+        on_step=on_step,
+        on_line=logging.getLogger("workers").info,
+        spare=False,
+    )
+    assert hang.done
+    assert wake.done
+    assert lost(seqs) == 0
+    assert longest_gap_s(result) <= 0.1
+    assert result.health["ingest-0"].counters["dispatch.resent.flow"] >= 1
+
+
 CONSUMER = """
 import sys, time
 from velod.config import ZenohSettings
@@ -204,7 +236,7 @@ def test_a_stopped_consumer_disturbs_nobody(slanted: Path, settings: Settings) -
 
 SERVICE = """
 import sys
-from velod.config import Settings, ZenohSettings
+from velod.config import FlowSettings, Settings, ZenohSettings
 from velod.runtime.supervisor import Supervisor
 from velod.runtime.warmup import plain_calibration
 from velod.runtime.worker import stop_on_signals

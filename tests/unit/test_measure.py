@@ -60,5 +60,17 @@ def test_a_large_jump_counts_everything_but_the_window() -> None:
 def test_a_publisher_that_starts_anew_is_no_gap() -> None:
     gaps = seen(0, 5, 6, 0, 1, 2)
     assert (gaps.lost, gaps.restarts) == (0, 1)
-    gaps = seen(64, 0, 1, 0, 1, 2)
-    assert (gaps.lost, gaps.restarts) == (0, 1)
+
+
+def test_a_straggler_from_long_ago_is_no_gap() -> None:
+    gaps = seen(4, *range(100), 10, 12, 100, 101)
+    assert (gaps.lost, gaps.restarts) == (0, 0)
+
+
+def test_a_forgotten_stream_starts_anywhere_and_keeps_its_losses() -> None:
+    gaps = seen(4, 0, 50)
+    before = gaps.lost
+    gaps.forget()
+    for seq in range(10):
+        gaps.see(seq)
+    assert gaps.lost == before == 45

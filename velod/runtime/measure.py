@@ -34,34 +34,38 @@ class GapCounter:
     """Counts the messages that one stream lost, by their ``seq``.
 
     ``window`` is how far messages may overtake each other (several workers publish on one key); a missing one is
-    counted once it is further back than that. A ``seq`` further back than any overtaking explains, or a 0 where 0
-    was already, is a publisher that started anew.
+    counted once it is further back than that. In an ordered stream (``window`` 0) a lower ``seq`` is a publisher that
+    started anew. In others it may be a straggler, so somebody who knows has to call ``forget``.
     """
 
     def __init__(self, window: int = 0) -> None:
+        self.window = window
         self.lost = 0
         self.restarts = 0
-        self._window = window
         self._next = -1
         self._missing: set[int] = set()
 
     def see(self, seq: int) -> None:
         """A message arrived."""
-        if self._next < 0 or self._started_anew(seq):
-            self._missing.clear()
+        if self._next < 0:
             self._next = seq + 1
-            return
-        if seq < self._next:
+        elif seq >= self._next:
+            self._advance(seq)
+        elif self.window:
             self._missing.discard(seq)
-            return
-        self._missing.update(range(max(self._next, seq - self._window), seq))
-        self.lost += max(0, seq - self._window - self._next)
-        self._next = seq + 1
-        given_up = [s for s in self._missing if s < seq - self._window]
-        self.lost += len(given_up)
-        self._missing.difference_update(given_up)
+        else:
+            self.restarts += 1
+            self._next = seq + 1
 
-    def _started_anew(self, seq: int) -> bool:
-        again = seq < self._next - self._window - 1 or (seq == 0 and self._next > 0 and seq not in self._missing)
-        self.restarts += again
-        return again
+    def forget(self) -> None:
+        """The next message is the first one of a new stream."""
+        self._next = -1
+        self._missing.clear()
+
+    def _advance(self, seq: int) -> None:
+        oldest = seq - self.window
+        given_up = {s for s in self._missing if s < oldest}
+        self._missing -= given_up
+        self._missing.update(range(max(self._next, oldest), seq))
+        self.lost += len(given_up) + max(0, oldest - self._next)
+        self._next = seq + 1

@@ -185,4 +185,13 @@ class WorkerShell:
         if (overtaking := self.inputs[topic]) >= 0:
             if at not in self._gaps:
                 self._gaps[at] = (topic.name, GapCounter(overtaking))
-            self._gaps[at][1].see(message.seq)
+            self._see(self._gaps[at][1], message.seq)
+
+    def _see(self, counter: GapCounter, seq: int) -> None:
+        """Count what is missing; where an ordered stream starts anew, so do those that were made from it."""
+        before = counter.restarts
+        counter.see(seq)
+        if counter.restarts > before:
+            for _, other in self._gaps.values():
+                if other.window:
+                    other.forget()
