@@ -1,0 +1,86 @@
+"""How long each part takes, on one core, beside a peer that computes the same in the same run."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+Run = Callable[[], Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Size:
+    """How much is computed."""
+
+    repeats: int = 200  # of each case
+    peer_repeats: int = 10  # of slow peers
+    seconds: float = 0.5  # of the event stream
+    events: int = 45_000  # of each camera in a batch
+    flows: int = 500  # of a batch of the solver's
+    window: int = 75  # batches in its window
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One thing to measure. ``per``: of how many units one run of ``run`` is made."""
+
+    name: str
+    run: Run
+    per: int = 1
+    peer: str | None = None
+    run_peer: Run | None = None
+    peer_per: int = 1
+    disagreement: Callable[[], float] | None = None
+    slow: bool = False  # the peer is
+    events: int = 0  # that one run takes in
+    clocked: bool = False  # ``run`` returns its own time, in ns
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """Median time of one unit, and the peer's; ``n`` is how often it was measured."""
+
+    name: str
+    median_us: float
+    peer: str | None
+    peer_median_us: float | None
+    n: int
+    mev_s: float | None = None
+
+    def row(self) -> dict[str, Any]:
+        """The fields of ``velod bench --json``; ratio = peer / ours."""
+        ratio = None if self.peer_median_us is None else self.peer_median_us / self.median_us
+        row = {
+            "name": self.name,
+            "median_us": self.median_us,
+            "peer": self.peer,
+            "peer_median_us": self.peer_median_us,
+            "ratio": ratio,
+            "n": self.n,
+        }
+        return row if self.mev_s is None else {**row, "mev_s": self.mev_s}
+
+
+def measure(case: Case, size: Size) -> Result:
+    """Run a case, and its peer, after one run of each that does not count (compiling, caches)."""
+    repeats = size.repeats if case.events == 0 else max(1, size.peer_repeats // 3)
+    ours_us = _median_us(case.run, repeats, case.clocked) / case.per
+    peer_us = None
+    if case.run_peer is not None:
+        peer_us = _median_us(case.run_peer, size.peer_repeats if case.slow else size.repeats) / case.peer_per
+    mev_s = case.events / (ours_us * case.per) if case.events else None
+    return Result(case.name, ours_us, case.peer, peer_us, repeats, mev_s)
+
+
+def _median_us(run: Run, repeats: int, clocked: bool = False) -> float:
+    run()
+    times_ns = []
+    for _ in range(repeats):
+        start_ns = time.perf_counter_ns()
+        own_ns = run()
+        times_ns.append(own_ns if clocked else time.perf_counter_ns() - start_ns)
+    return float(np.median(times_ns)) / 1e3
