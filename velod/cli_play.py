@@ -65,7 +65,13 @@ def replay(config: str | None, file: str, options: PlayOptions, csv: str | None)
 
 
 def evaluate_files(
-    config: str | None, files: list[str], options: PlayOptions, json: str | None, plot: str | None
+    config: str | None,
+    files: list[str],
+    options: PlayOptions,
+    json: str | None,
+    plot: str | None,
+    *,
+    floor: bool = False,
 ) -> int:
     """Judge recordings against the truth that they hold. Raises RunFailed if one yields no valid velocity."""
     rows, failed = [], []
@@ -74,9 +80,10 @@ def evaluate_files(
         metrics = _metrics(played)
         if metrics is None:
             raise ValueError(f"{file}: holds no truth to judge against; `velod replay` needs none")
+        floor_mps = _floor_mps(config, played) if floor else None
         # With --json - the table must not get into the JSON.
-        print(summary(played, metrics), file=sys.stderr if json == "-" else sys.stdout)
-        rows.append(result_row(played, metrics))
+        print(summary(played, metrics, floor_mps), file=sys.stderr if json == "-" else sys.stdout)
+        rows.append(result_row(played, metrics, floor_mps))
         if not has_velocity(played):
             failed.append(file)
         elif plot is not None:
@@ -172,16 +179,23 @@ def _metrics(played: Played) -> Metrics | None:
     return evaluate(played.velocities, played.recording.truth, played.recording.t_start_ns)
 
 
-def result_row(played: Played, metrics: Metrics) -> dict[str, float | int | None]:
+def _floor_mps(config: str | None, played: Played) -> float | None:
+    from velod.cli_compare import floor_mps
+
+    return floor_mps(settings_of(config), played.recording)
+
+
+def result_row(played: Played, metrics: Metrics, floor_mps: float | None = None) -> dict[str, float | int | None]:
     """One result as ``--json`` writes it; what is not known is null."""
     return metrics.row(
+        ave_floor_mps=floor_mps,
         real_time_factor=played.real_time_factor,
         latency_p50_ms=played.latency_p50_ms,
         latency_p99_ms=played.latency_p99_ms,
     )
 
 
-def summary(played: Played, metrics: Metrics | None) -> str:
+def summary(played: Played, metrics: Metrics | None, floor_mps: float | None = None) -> str:
     """What a run was and what came out of it, for people."""
     r = played.recording
     how = "one process" if played.offline else "four stages, processes of their own"
@@ -190,6 +204,8 @@ def summary(played: Played, metrics: Metrics | None) -> str:
         f"{played.real_time_factor:.2f} x real time"
     ]
     lines.append(metrics.summary() if metrics is not None else _without_truth(played))
+    if floor_mps is not None:
+        lines.append(f"floor          {floor_mps:8.4f} m/s   (AVE with perfect flow and depth)")
     if math.isfinite(played.rate_hz):
         lines.append(f"rate           {played.rate_hz:8.2f} Hz")
     if played.latency_p50_ms is not None and played.latency_p99_ms is not None:

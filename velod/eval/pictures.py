@@ -1,0 +1,165 @@
+"""Pictures that compare methods, and what the front end sees."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from velod.eval.compare import METHODS, Case
+from velod.eval.dead_reckoning import Track
+from velod.eval.plots import PlotError
+from velod.io.model import NO_EVENTS, EventColumns, EventSource
+from velod.types import F64, I64, NS_PER_S, DepthBatch, FlowBatch
+
+RelativeErrors = tuple[str, Mapping[str, F64]]
+"""Name of a recording, and the relative errors (%) of each method."""
+
+_COLOURS = {
+    "velod": "#0b5fa5",
+    "floor": "#7a7a7a",
+    "paper-like": "#e07b00",
+    "linear": "#3a9a3a",
+    "Benosman-NF": "#c02f2f",
+    "IMU": "#8a4fbf",
+}
+_EVENTS_NS = 10_000_000
+_ARROW_S = 0.02
+_ARROWS = 220
+
+
+def figure_class() -> Any:
+    """matplotlib's Figure. Raises PlotError where it is not installed."""
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise PlotError("pictures need matplotlib: pip install 'velod[plot]'") from None
+    return Figure
+
+
+def error_over_time(name: str, errors: Mapping[str, tuple[I64, F64, F64]]) -> Any:
+    """|v_gt - v_est| of each method over time, logarithmic."""
+    figure = figure_class()(figsize=(11, 4.6), layout="constrained")
+    axes = figure.subplots()
+    for method in reversed([m for m in METHODS if m in errors]):  # velod on top
+        t_ns, error, _ = errors[method]
+        if len(error) == 0:
+            continue
+        width = 1.8 if method == "velod" else 1.0
+        label = f"{method}: AVE {error.mean():.3g} m/s"
+        axes.plot(t_ns / NS_PER_S, np.maximum(error, 1e-4), color=_COLOURS[method], lw=width, label=label)
+    axes.set(yscale="log", xlabel="sensor time [s]", ylabel="|v_gt - v_est| [m/s]", title=name)
+    axes.grid(alpha=0.3, which="both")
+    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), reverse=True, frameon=False)
+    return figure
+
+
+def relative_errors(recordings: Sequence[RelativeErrors]) -> Any:
+    """Box plots of Eq. 16, one group for each recording."""
+    from matplotlib.patches import Patch
+
+    figure = figure_class()(figsize=(max(7.0, 1.6 * len(recordings) + 2.5), 5.0), layout="constrained")
+    axes = figure.subplots()
+    width = 0.8 / len(METHODS)
+    for k, (_, relative) in enumerate(recordings):
+        for i, method in enumerate(METHODS):
+            values = relative.get(method, np.empty(0))
+            values = values[np.isfinite(values)]
+            if len(values):
+                box = axes.boxplot(
+                    [values],
+                    positions=[k + (i - (len(METHODS) - 1) / 2) * width],
+                    widths=0.85 * width,
+                    whis=(5, 95),
+                    showfliers=False,
+                    patch_artist=True,
+                    medianprops={"color": "black"},
+                )
+                box["boxes"][0].set_facecolor(_COLOURS[method])
+    axes.set(yscale="log", ylabel="RVE [%]", xlim=(-0.5, len(recordings) - 0.5))
+    axes.set_xticks(range(len(recordings)), [name for name, _ in recordings])
+    axes.grid(alpha=0.3, axis="y", which="both")
+    handles = [Patch(facecolor=_COLOURS[m], label=m) for m in METHODS]
+    axes.legend(handles=handles, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+    return figure
+
+
+def tracks(name: str, found: Mapping[str, Track]) -> Any:
+    """Dead-reckoned paths from above, and the true one; what leaves the picture is cut off."""
+    figure = figure_class()(figsize=(9, 6.2), layout="constrained")
+    axes = figure.subplots()
+    for method in ("Benosman-NF", "IMU", "linear", "paper-like", "velod"):
+        if method in found:
+            track = found[method]
+            label = f"{method}: drift {track.drift_percent:.2g} %"
+            axes.plot(track.p_WB[:, 0], track.p_WB[:, 1], color=_COLOURS[method], lw=1.4, label=label)
+    true = max((t.true_p_WB for t in found.values()), key=len, default=np.zeros((1, 3)))
+    axes.plot(true[:, 0], true[:, 1], "k--", lw=1.0, label="truth")
+    axes.plot(true[0, 0], true[0, 1], "ko", ms=5, label="start")
+    low, high = true[:, :2].min(axis=0), true[:, :2].max(axis=0)
+    margin = 0.25 * float((high - low).max()) + 0.05
+    axes.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin))
+    axes.set(xlabel="x_W [m]", ylabel="y_W [m]", title=name, aspect="equal")
+    axes.grid(alpha=0.3)
+    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+    return figure
+
+
+def front_end(name: str, case: Case, left: EventSource) -> Any:
+    """Events of the moment in the middle of a recording with its normal flow, and with its depth."""
+    figure = figure_class()(figsize=(13, 5.0), layout="constrained")
+    flow_axes, depth_axes = figure.subplots(1, 2)
+    batches = list(case.own.batches())
+    if not batches:
+        figure.suptitle(f"{name}: no batch with flow and depth")
+        return figure
+    flow, depth = batches[len(batches) // 2]
+    events = _events_until(left, flow.t_ns)
+    camera = case.calibration.left
+    for axes in (flow_axes, depth_axes):
+        axes.set(
+            xlim=(-0.5, camera.width - 0.5), ylim=(camera.height - 0.5, -0.5), aspect="equal", xticks=[], yticks=[]
+        )
+    flow_axes.imshow(_event_image(events, camera.width, camera.height), interpolation="nearest")
+    depth_axes.imshow(0.75 + 0.25 * _event_image(events, camera.width, camera.height), interpolation="nearest")
+    _draw_arrows(flow_axes, flow)
+    _draw_depth(figure, depth_axes, flow, depth)
+    flow_axes.set_title(f"{name}, t = {flow.t_ns / NS_PER_S:.3f} s: ON red, OFF blue, normal flow green")
+    depth_axes.set_title("depth of the selected events")
+    return figure
+
+
+def _draw_arrows(axes: Any, flow: FlowBatch) -> None:
+    some = slice(None, None, max(1, len(flow.x) // _ARROWS))
+    d = flow.n[some] * flow.speed[some, None] * _ARROW_S
+    axes.quiver(
+        flow.x[some], flow.y[some], d[:, 0], d[:, 1],
+        angles="xy", scale_units="xy", scale=1.0, color="#00a000", width=0.003, headwidth=4.0,
+    )  # fmt: skip
+
+
+def _draw_depth(figure: Any, axes: Any, flow: FlowBatch, depth: DepthBatch) -> None:
+    z = 1.0 / depth.inv_depth
+    low, high = np.percentile(z, (2, 98)) if len(z) else (0.0, 1.0)
+    dots = axes.scatter(flow.x, flow.y, c=z, s=9, cmap="turbo_r", vmin=low, vmax=high)
+    figure.colorbar(dots, ax=axes, label="depth [m]", shrink=0.8)
+
+
+def _event_image(events: EventColumns, width: int, height: int) -> F64:
+    """(height, width, 3): red where the last event was ON, blue where it was OFF, white without."""
+    image = np.ones((height, width, 3))
+    image[events.y, events.x] = np.where(events.p[:, None] == 1, (0.95, 0.45, 0.40), (0.40, 0.55, 0.95))
+    return image
+
+
+def _events_until(left: EventSource, t_ns: int) -> EventColumns:
+    """Those of the last 10 ms before ``t_ns``."""
+    parts = []
+    for block in left.blocks():
+        if len(block.t_ns) and block.t_ns[0] >= t_ns:
+            break
+        inside = (block.t_ns >= t_ns - _EVENTS_NS) & (block.t_ns < t_ns)
+        if inside.any():
+            parts.append([column[inside] for column in (block.t_ns, block.x, block.y, block.p)])
+    return EventColumns(*(np.concatenate(columns) for columns in zip(*parts, strict=True))) if parts else NO_EVENTS

@@ -1,0 +1,148 @@
+"""The report: one HTML page that holds everything, and its pictures as files beside it."""
+
+from __future__ import annotations
+
+import base64
+import html
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from velod.eval import pictures
+from velod.eval.compare import Case
+from velod.eval.paper import PAPER, TABLE_IV_MS
+from velod.eval.plots import plot_run
+from velod.eval.table import Row
+from velod.io.model import EventSource
+
+Table = Sequence[Sequence[str]]
+
+_STYLE = """
+body { font: 15px/1.45 system-ui, sans-serif; color: #222; max-width: 1250px; margin: 2em auto; padding: 0 1em }
+h1 { font-size: 1.5em } h2 { font-size: 1.2em; margin-top: 2em; border-bottom: 1px solid #ccc }
+table { border-collapse: collapse; font-size: 13px; font-variant-numeric: tabular-nums }
+th, td { padding: 2px 9px; text-align: right; border-bottom: 1px solid #e4e4e4 }
+th:first-child, td:first-child { text-align: left } th { background: #f4f4f4 }
+.wide { overflow-x: auto } figure { margin: 1em 0 } img { max-width: 100% } figcaption { color: #555 }
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class StageTimes:
+    """Mean host time per batch, ms."""
+
+    preprocessing_ms: float
+    flow_ms: float
+    depth_ms: float
+    back_end_ms: float
+
+
+class Report:
+    """Takes one recording after the other; ``finish`` writes the page.
+
+    Raises PlotError without matplotlib, OSError where ``directory`` cannot be written.
+    """
+
+    def __init__(self, directory: str | Path, command: str) -> None:
+        pictures.figure_class()  # say so now, not after an hour
+        self._directory = Path(directory)
+        self._directory.mkdir(parents=True, exist_ok=True)
+        self._command = command
+        self._rows: list[Row] = []
+        self._relative: list[pictures.RelativeErrors] = []
+        self._table_i: list[list[str]] = []
+        self._times: list[tuple[str, StageTimes]] = []
+        self._sections: list[str] = []
+
+    def add(self, row: Row, case: Case, left: EventSource, times: StageTimes) -> None:
+        """Draw the pictures of one recording, of its first IMU noise."""
+        first = {method: runs[0] for method, runs in row.judgement.items()}
+        errors = {method: judged.errors(case.truth) for method, judged in first.items()}
+        figures = {
+            "methods": (pictures.error_over_time(row.name, errors), "Absolute velocity error over time (as Fig. 6)."),
+            "track": (
+                pictures.tracks(row.name, {m: j.track for m, j in first.items() if j.track is not None}),
+                "Dead reckoning seen from above (as Fig. 8): one integration of the velocity, attitude by the "
+                "gyroscope, from the true place at the first valid velocity.",
+            ),
+            "events": (
+                pictures.front_end(row.name, case, left),
+                "Events of 10 ms, normal flow (every arrow shows 20 ms of motion), and depth.",
+            ),
+        }
+        images = [self._image(f"{row.name}_{kind}", figure, text) for kind, (figure, text) in figures.items()]
+        if first["velod"].ever_valid:
+            velocity = plot_run(first["velod"].velocities, case.truth, self._directory, row.name)[0]
+            images.insert(1, _inline(velocity, "Velocity in the body frame with 3-sigma bands, and the truth."))
+        self._sections.append(f"<h2>{html.escape(row.name)}</h2>\n" + "\n".join(images))
+        self._rows.append(row)
+        self._relative.append((row.name, {method: relative for method, (_, _, relative) in errors.items()}))
+        self._table_i.append(_motion(row, case))
+        self._times.append((row.name, times))
+
+    def finish(self, tables: Mapping[str, Table], notes: Sequence[str]) -> Path:
+        """Write ``report.html``; returns its path."""
+        boxes = self._image(
+            "rve",
+            pictures.relative_errors(self._relative),
+            "Relative velocity error (as Fig. 7): box 25-75 %, whiskers 5-95 %.",
+        )
+        parts = [f"<h2>{html.escape(title)}</h2>\n{_html_table(lines)}" for title, lines in tables.items()]
+        parts.append("<ul>" + "".join(f"<li>{html.escape(note)}</li>" for note in notes) + "</ul>")
+        head = ["sequence", "s", "mean |v| m/s", "mean |w| rad/s", "left events, M/s", "Table I: |v|", "|w|"]
+        parts.append(f"<h2>Motion and events, beside Table I</h2>\n{_html_table([head, *self._table_i])}")
+        parts.append(f"<h2>Time per batch, beside Table IV (ms)</h2>\n{_html_table(self._table_iv())}")
+        path = self._directory / "report.html"
+        path.write_text(
+            '<!doctype html>\n<html lang="en"><meta charset="utf-8"><title>velod: evaluation</title>\n'
+            f"<style>{_STYLE}</style>\n<h1>velod: evaluation</h1>\n<p><code>{html.escape(self._command)}</code></p>\n"
+            + "\n".join([*parts, boxes, *self._sections])
+            + "\n</html>\n",
+            encoding="utf-8",
+        )
+        return path
+
+    def _table_iv(self) -> list[list[str]]:
+        head = ["", "preprocessing", "flow", "depth", "flow and depth", "back end", "overall"]
+        lines = [head]
+        for name, t in self._times:
+            both = t.flow_ms + t.depth_ms
+            values = (t.preprocessing_ms, t.flow_ms, t.depth_ms, both, t.back_end_ms)
+            overall = t.preprocessing_ms + both + t.back_end_ms
+            lines.append([name, *(f"{v:.1f}" for v in (*values, overall))])
+        paper = TABLE_IV_MS
+        lines.append(
+            ["paper", f"{paper['preprocessing']:.0f}", "", ""]
+            + [f"{paper[k]:.0f}" for k in ("flow and depth", "back end", "overall")]
+        )
+        return lines
+
+    def _image(self, name: str, figure: Any, caption: str) -> str:
+        path = self._directory / f"{name}.png"
+        figure.savefig(path, dpi=110)
+        return _inline(path, caption)
+
+
+def _motion(row: Row, case: Case) -> list[str]:
+    speed, rate = (float(np.linalg.norm(a, axis=1).mean()) for a in (case.truth.v_B, case.truth.omega_B))
+    paper = PAPER.get(row.name)
+    beside = ["", ""] if paper is None else [f"{paper.speed_mps:.2f}", f"{paper.rate_rad_s:.2f}"]
+    events = sum(case.own.events) / row.seconds * 1e-6
+    return [row.name, f"{row.seconds:g}", f"{speed:.2f}", f"{rate:.2f}", f"{events:.2f}", *beside]
+
+
+def _html_table(lines: Table) -> str:
+    head = "".join(f"<th>{html.escape(cell)}</th>" for cell in lines[0])
+    body = "\n".join(
+        "<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in line) + "</tr>" for line in lines[1:]
+    )
+    return f'<div class="wide"><table><tr>{head}</tr>\n{body}</table></div>'
+
+
+def _inline(path: Path, caption: str) -> str:
+    data = base64.b64encode(path.read_bytes()).decode("ascii")
+    text = html.escape(caption)
+    return f'<figure><img alt="{text}" src="data:image/png;base64,{data}"><figcaption>{text}</figcaption></figure>'
