@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
@@ -139,6 +140,14 @@ def _warmup(args: argparse.Namespace) -> int:
     return warmup()
 
 
+def _bench(args: argparse.Namespace) -> int:
+    # Before numpy is loaded: with threads the peers would be measured on all cores, and velod is on one.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    from velod.cli_bench import bench
+
+    return bench(args.group, args.json)
+
+
 # --- the parser ---
 
 _SEQUENCES = "corridor-1..3, boxes-4..5, spin-1..3 (Table I of the paper)"
@@ -160,11 +169,23 @@ first steps:
     )
     parser.add_argument("--version", action="version", version=f"velod {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for add in (_add_demo, _add_run, _add_replay, _add_eval, _add_sim, _add_echo, _add_top, _add_config, _add_warmup):
+    for add in (
+        _add_demo,
+        _add_run,
+        _add_replay,
+        _add_eval,
+        _add_sim,
+        _add_echo,
+        _add_top,
+        _add_config,
+        _add_bench,
+        _add_warmup,
+    ):
         add(commands)
     return parser
 
 
+_BENCHES = ("all", "flow", "depth", "solve", "codec", "pipeline")
 _Commands = argparse._SubParsersAction  # argparse has no public name for it
 
 
@@ -385,6 +406,23 @@ examples:
     )
     calibration.add_argument("imu", nargs="?", metavar="IMU", help="Kalibr: file with T_cam_imu, where it is another")
     calibration.set_defaults(command=_config_calibration)
+
+
+def _add_bench(commands: _Commands[argparse.ArgumentParser]) -> None:
+    parser = _command(
+        commands,
+        "bench",
+        _bench,
+        "How long each part takes on this machine, beside a peer.",
+        "On one core, on simulated input, as medians; peers (numpy, OpenCV, pickle) run in the same process. Close\n"
+        "what else computes first.",
+        "  velod bench                           everything, in about 20 s\n"
+        "  velod bench solve --json out.json     the optimizer alone; the numbers into a file",
+    )
+    parser.add_argument(
+        "group", nargs="?", default="all", choices=_BENCHES, metavar="GROUP", help=", ".join(_BENCHES)
+    )
+    parser.add_argument("--json", metavar="OUT", help="write the results; - for stdout")
 
 
 def _add_warmup(commands: _Commands[argparse.ArgumentParser]) -> None:
