@@ -36,7 +36,7 @@ _SPEED_PX_S = 250.0
 _DISPARITY_PX = 8
 _BATCH_NS = 20_000_000
 _IMU_NS = 5_000_000
-_SECONDS = 0.6
+_SECONDS = 1.3  # longer than the window, so that its oldest segment leaves it
 _SPECIFIC_FORCE = (0.0, -9.81, 0.0)  # at rest, y down
 
 
