@@ -97,8 +97,11 @@ def judge(velocities: Sequence[Velocity], imu: Imu, truth: Truth, t_start_ns: in
 
     The paper's estimates carry no validity: where none is valid, every velocity that a batch went into counts.
     """
-    ever_valid = any(v.valid for v in velocities)
-    judged = list(velocities) if ever_valid else [replace(v, valid=True) for v in velocities if v.batch_seq >= 0]
+    first = next((i for i, v in enumerate(velocities) if v.valid), None)
+    ever_valid = first is not None
+    judged = (
+        list(velocities[first:]) if ever_valid else [replace(v, valid=True) for v in velocities if v.batch_seq >= 0]
+    )
     return Judged(judged, evaluate(judged, truth, t_start_ns), dead_reckoning(judged, imu, truth), ever_valid)
 
 

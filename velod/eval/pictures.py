@@ -25,7 +25,7 @@ _COLOURS = {
     "IMU": "#8a4fbf",
 }
 _EVENTS_NS = 10_000_000
-_ARROW_S = 0.02
+_ARROW_PX = 14.0
 _ARROWS = 220
 
 
@@ -92,7 +92,7 @@ def tracks(name: str, found: Mapping[str, Track]) -> Any:
     for method in ("Benosman-NF", "IMU", "linear", "paper-like", "velod"):
         if method in found:
             track = found[method]
-            label = f"{method}: drift {track.drift_percent:.2g} %"
+            label = f"{method}: drift {track.drift_percent:.3g} %"
             axes.plot(track.p_WB[:, 0], track.p_WB[:, 1], color=_COLOURS[method], lw=1.4, label=label)
     true = max((t.true_p_WB for t in found.values()), key=len, default=np.zeros((1, 3)))
     axes.plot(true[:, 0], true[:, 1], "k--", lw=1.0, label="truth")
@@ -123,20 +123,26 @@ def front_end(name: str, case: Case, left: EventSource) -> Any:
         )
     flow_axes.imshow(_event_image(events, camera.width, camera.height), interpolation="nearest")
     depth_axes.imshow(0.75 + 0.25 * _event_image(events, camera.width, camera.height), interpolation="nearest")
-    _draw_arrows(flow_axes, flow)
+    arrow_s = _draw_arrows(flow_axes, flow)
     _draw_depth(figure, depth_axes, flow, depth)
-    flow_axes.set_title(f"{name}, t = {flow.t_ns / NS_PER_S:.3f} s: ON red, OFF blue, normal flow green")
+    flow_axes.set_title(
+        f"{name}, t = {flow.t_ns / NS_PER_S:.3f} s: ON red, OFF blue, normal flow over {1e3 * arrow_s:g} ms"
+    )
     depth_axes.set_title("depth of the selected events")
     return figure
 
 
-def _draw_arrows(axes: Any, flow: FlowBatch) -> None:
+def _draw_arrows(axes: Any, flow: FlowBatch) -> float:
+    """Arrows of about _ARROW_PX; returns over how many seconds they show the motion."""
+    exact_s = _ARROW_PX / max(float(np.median(flow.speed)), 1e-3) if len(flow.x) else 0.01
+    arrow_s = float(f"{exact_s:.0e}")  # one digit
     some = slice(None, None, max(1, len(flow.x) // _ARROWS))
-    d = flow.n[some] * flow.speed[some, None] * _ARROW_S
+    d = flow.n[some] * flow.speed[some, None] * arrow_s
     axes.quiver(
         flow.x[some], flow.y[some], d[:, 0], d[:, 1],
-        angles="xy", scale_units="xy", scale=1.0, color="#00a000", width=0.003, headwidth=4.0,
+        angles="xy", scale_units="xy", scale=1.0, color="#008a00", width=0.0025, headwidth=3.5,
     )  # fmt: skip
+    return arrow_s
 
 
 def _draw_depth(figure: Any, axes: Any, flow: FlowBatch, depth: DepthBatch) -> None:

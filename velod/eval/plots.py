@@ -62,7 +62,7 @@ def _draw_velocity(figure: Any, shown: Sequence[Velocity], truth: Truth | None) 
             axes.plot(truth.t_ns / NS_PER_S, truth.v_B[:, i], "k--", lw=0.8, label="truth")
         axes.set_ylabel(f"v_{_AXES[i]} [m/s]")
         axes.grid(alpha=0.3)
-    figure.axes[0].legend(loc="upper right", ncols=3)
+    figure.axes[0].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, frameon=False)
     figure.axes[-1].set_xlabel("sensor time [s]")
     return figure
 

@@ -1,0 +1,139 @@
+"""Tables of a comparison: what stands in them, how it is rounded, and what is said about it."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from velod.eval.compare import METHODS, Judged, Judgement, judge
+from velod.eval.metrics import evaluate
+from velod.eval.paper import PAPER, TABLE_IV_MS
+from velod.eval.table import Row, as_json, ave_table, detail_table, notes, rve_table, spread, text_table
+from velod.io.model import Imu, Truth
+from velod.types import Velocity
+
+T_NS = np.arange(0, 1_000_000_001, 10_000_000)
+TRUTH = Truth(
+    T_NS,
+    np.tile([2.0, 0.0, 0.0], (len(T_NS), 1)),
+    np.zeros((len(T_NS), 3)),
+    np.tile([0.0, 0.0, 0.0, 1.0], (len(T_NS), 1)),
+)
+IMU = Imu(T_NS, np.tile([0.0, 0.0, 9.81], (len(T_NS), 1)), np.zeros((len(T_NS), 3)))
+
+
+def off_by(error_mps: float, valid: bool = True) -> list[Velocity]:
+    return [
+        Velocity(k, int(t), np.array([2.0 + error_mps, 0.0, 0.0]), np.eye(3), valid, "tracking", "", k, int(t))
+        for k, t in enumerate(T_NS)
+    ]
+
+
+def judged(error_mps: float, valid: bool = True) -> Judged:
+    return judge(off_by(error_mps, valid), IMU, TRUTH, 0)
+
+
+def row(name: str = "corridor-1", **errors: list[float]) -> Row:
+    judgement: Judgement = {method: [judged(e) for e in values] for method, values in errors.items()}
+    return Row(name, 10.0, judgement, 90.0, (judged(3.0),))
+
+
+def cell(table: list[list[str]], column: str, line: int = 1) -> str:
+    return table[line][table[0].index(column)]
+
+
+@pytest.mark.parametrize(
+    ("values", "text"),
+    [
+        ([0.0312, 0.0288], "0.030±0.002"),
+        ([1.5], "1.50"),
+        ([17.0, 19.0], "18.00±1.41"),
+        ([682.7], "683"),
+        ([math.nan], "-"),
+        ([], "-"),
+        ([math.inf, 2.0], "2.00"),
+    ],
+)
+def test_a_mean_is_shown_with_its_spread_and_no_more_digits_than_it_has(values: list[float], text: str) -> None:
+    assert spread(values).text() == text
+
+
+def test_each_method_stands_in_its_column_beside_the_papers_numbers() -> None:
+    table = ave_table([row(velod=[0.03, 0.05], linear=[0.2])])
+    assert cell(table, "velod") == "0.040±0.014"
+    assert cell(table, "linear") == "0.200"
+    assert cell(table, "floor") == "-"
+    assert cell(table, "IMU long") == "3.00"
+    assert table[1][-4:] == ["0.09", "2.67", "10.78", "Table II"]
+
+
+def test_relative_errors_stand_beside_the_papers_error_over_its_speed() -> None:
+    table = rve_table([row(velod=[0.03])])
+    assert cell(table, "velod") == "1.50"
+    assert cell(table, "paper: AVE/speed") == "1.58"
+
+
+def test_a_recording_that_the_paper_does_not_have_stands_alone() -> None:
+    table = ave_table([Row("mine", 1.0, {"velod": [judged(0.1)]})])
+    assert table[1][-4:] == ["", "", "", ""]
+    assert cell(table, "IMU long") == ""
+
+
+def test_a_method_without_a_valid_velocity_is_judged_all_the_same_and_marked() -> None:
+    rows = [Row("corridor-1", 1.0, {"velod": [judged(0.1)], "Benosman-NF": [judged(10.0, valid=False)]})]
+    assert cell(ave_table(rows), "Benosman-NF") == "10.00*"
+    assert cell(ave_table(rows), "velod") == "0.100"
+    assert any(note.startswith("*") for note in notes(rows, [1]))
+    assert not any(note.startswith("*") for note in notes([row(velod=[0.1])], [1]))
+
+
+def test_simulated_spins_are_said_to_stand_beside_real_ones() -> None:
+    rows = [row("spin-2", velod=[0.05])]
+    assert ave_table(rows)[1][-1] == "Table III r"
+    assert any(note.startswith("r ") for note in notes(rows, [1]))
+
+
+def test_only_velocities_from_the_first_valid_one_on_are_judged() -> None:
+    velocities = off_by(5.0, valid=False)[:50] + off_by(0.1)[50:]
+    result = judge(velocities, IMU, TRUTH, 0)
+    t_ns, error, relative = result.errors(TRUTH)
+    assert t_ns[0] == T_NS[50] == result.metrics.first_valid_s * 1e9
+    np.testing.assert_allclose(error, 0.1)
+    np.testing.assert_allclose(relative, 5.0)
+    assert error.mean() == pytest.approx(result.metrics.ave_mps)
+
+
+def test_drift_is_that_of_dead_reckoning() -> None:
+    assert float(cell(detail_table([row(velod=[0.1])]), "drift %: velod")) == pytest.approx(5.0)
+
+
+def test_columns_are_aligned_and_numbers_stand_to_the_right() -> None:
+    assert text_table([["name", "n"], ["a", "10"], ["longer", "7"]]) == "name     n\na       10\nlonger   7"
+
+
+def test_what_is_not_known_is_null_in_the_json() -> None:
+    tree = json.loads(json.dumps(as_json([Row("mine", 1.0, {"velod": [judged(0.1)]})], []), allow_nan=False))
+    velod = tree["sequences"][0]["methods"]["velod"]
+    assert velod["ave_mps"] == {"mean": pytest.approx(0.1), "spread": None, "values": [pytest.approx(0.1)]}
+    assert velod["ever_valid"] is True
+    assert tree["sequences"][0]["paper"] is None
+
+
+def test_the_papers_tables_are_complete() -> None:
+    assert len(PAPER) == 8
+    # Ours wins every row of Tables II and III, as the paper says.
+    assert all(p.ours_mps < min(p.imu_mps, p.benosman_mps) for p in PAPER.values())
+    assert TABLE_IV_MS["overall"] == sum(TABLE_IV_MS[k] for k in ("preprocessing", "flow and depth", "back end"))
+
+
+def test_every_method_has_a_column_and_an_explanation() -> None:
+    assert set(METHODS) <= set(ave_table([])[0])
+    assert all(any(note.startswith(m) for note in notes([], [1, 2])) for m in METHODS if m != "velod")
+
+
+def test_judging_agrees_with_the_metrics_of_velod_eval() -> None:
+    velocities = off_by(0.1)
+    assert judge(velocities, IMU, TRUTH, 0).metrics == evaluate(velocities, TRUTH, 0)
