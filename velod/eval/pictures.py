@@ -24,7 +24,7 @@ _COLOURS = {
     "Benosman-NF": "#c02f2f",
     "IMU": "#8a4fbf",
 }
-_EVENTS_NS = 10_000_000
+_TRAIL_PX = 4.0
 _ARROW_PX = 14.0
 _ARROWS = 220
 
@@ -115,7 +115,8 @@ def front_end(name: str, case: Case, left: EventSource) -> Any:
         figure.suptitle(f"{name}: no batch with flow and depth")
         return figure
     flow, depth = batches[len(batches) // 2]
-    events = _events_until(left, flow.t_ns)
+    trail_s, arrow_s = (_motion_time(flow, px) for px in (_TRAIL_PX, _ARROW_PX))
+    events = _events_within(left, flow.t_ns - int(trail_s * NS_PER_S), flow.t_ns)
     camera = case.calibration.left
     for axes in (flow_axes, depth_axes):
         axes.set(
@@ -123,26 +124,28 @@ def front_end(name: str, case: Case, left: EventSource) -> Any:
         )
     flow_axes.imshow(_event_image(events, camera.width, camera.height), interpolation="nearest")
     depth_axes.imshow(0.75 + 0.25 * _event_image(events, camera.width, camera.height), interpolation="nearest")
-    arrow_s = _draw_arrows(flow_axes, flow)
+    _draw_arrows(flow_axes, flow, arrow_s)
     _draw_depth(figure, depth_axes, flow, depth)
-    flow_axes.set_title(
-        f"{name}, t = {flow.t_ns / NS_PER_S:.3f} s: ON red, OFF blue, normal flow over {1e3 * arrow_s:g} ms"
-    )
+    figure.suptitle(f"{name}, t = {flow.t_ns / NS_PER_S:.3f} s")
+    flow_axes.set_title(f"events of {1e3 * trail_s:g} ms (ON red, OFF blue), normal flow over {1e3 * arrow_s:g} ms")
     depth_axes.set_title("depth of the selected events")
     return figure
 
 
-def _draw_arrows(axes: Any, flow: FlowBatch) -> float:
-    """Arrows of about _ARROW_PX; returns over how many seconds they show the motion."""
-    exact_s = _ARROW_PX / max(float(np.median(flow.speed)), 1e-3) if len(flow.x) else 0.01
-    arrow_s = float(f"{exact_s:.0e}")  # one digit
+def _motion_time(flow: FlowBatch, px: float) -> float:
+    """In which an edge moves by about ``px``, s, to one digit; at most 0.1."""
+    speed = float(np.median(flow.speed)) if len(flow.x) else 0.0
+    return float(f"{px / max(speed, 10.0 * px):.0e}")
+
+
+def _draw_arrows(axes: Any, flow: FlowBatch, arrow_s: float) -> None:
+    """The motion of some edges over ``arrow_s``."""
     some = slice(None, None, max(1, len(flow.x) // _ARROWS))
     d = flow.n[some] * flow.speed[some, None] * arrow_s
     axes.quiver(
         flow.x[some], flow.y[some], d[:, 0], d[:, 1],
         angles="xy", scale_units="xy", scale=1.0, color="#008a00", width=0.0025, headwidth=3.5,
     )  # fmt: skip
-    return arrow_s
 
 
 def _draw_depth(figure: Any, axes: Any, flow: FlowBatch, depth: DepthBatch) -> None:
@@ -159,13 +162,13 @@ def _event_image(events: EventColumns, width: int, height: int) -> F64:
     return image
 
 
-def _events_until(left: EventSource, t_ns: int) -> EventColumns:
-    """Those of the last 10 ms before ``t_ns``."""
+def _events_within(left: EventSource, begin_ns: int, end_ns: int) -> EventColumns:
+    """Those of [begin_ns, end_ns)."""
     parts = []
     for block in left.blocks():
-        if len(block.t_ns) and block.t_ns[0] >= t_ns:
+        if len(block.t_ns) and block.t_ns[0] >= end_ns:
             break
-        inside = (block.t_ns >= t_ns - _EVENTS_NS) & (block.t_ns < t_ns)
+        inside = (block.t_ns >= begin_ns) & (block.t_ns < end_ns)
         if inside.any():
             parts.append([column[inside] for column in (block.t_ns, block.x, block.y, block.p)])
     return EventColumns(*(np.concatenate(columns) for columns in zip(*parts, strict=True))) if parts else NO_EVENTS

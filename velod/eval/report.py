@@ -70,7 +70,7 @@ class Report:
             ),
             "events": (
                 pictures.front_end(row.name, case, left),
-                "Events of 10 ms in the middle of the recording, with normal flow and with depth.",
+                "Events in the middle of the recording, with normal flow and with depth.",
             ),
         }
         images = [self._image(f"{row.name}_{kind}", figure, text) for kind, (figure, text) in figures.items()]
