@@ -19,6 +19,7 @@ class Size:
     repeats: int = 200  # of each case
     peer_repeats: int = 10  # of slow peers
     seconds: float = 0.5  # of the event stream
+    dataflow_seconds: float = 2.0  # of the one through all processes
     events: int = 45_000  # of each camera in a batch
     flows: int = 500  # of a batch of the solver's
     window: int = 75  # batches in its window

@@ -25,9 +25,20 @@ from velod.events.sae import NEVER, new_surface, update_sae
 from velod.flow.stage import FlowStage
 from velod.ingest.stage import IngestStage
 from velod.optimizer.estimator import BIN_NS, Estimator
-from velod.optimizer.flow_equation import Fit, Rows, compress
-from velod.optimizer.window import BLOCK
-from velod.types import F64, NS_PER_S, EventBatch, EventPacket, FlowBatch, ImuPacket, Message, StereoBatch, Velocity
+from velod.optimizer.flow_equation import Fit, Rows, body_rows, compress, on_velocity, solve
+from velod.optimizer.window import BLOCK, Window
+from velod.types import (
+    F64,
+    NS_PER_S,
+    DepthBatch,
+    EventBatch,
+    EventPacket,
+    FlowBatch,
+    ImuPacket,
+    Message,
+    StereoBatch,
+    Velocity,
+)
 from velod.wire import decode, encode
 
 GROUPS = ("flow", "depth", "solve", "codec", "pipeline")
@@ -57,7 +68,7 @@ def cases(group: str, size: Size, run_pipeline: RunPipeline) -> Iterator[Case]:
         yield codec(selected(size))
     elif group == "pipeline":
         yield ingest(size)
-        yield sustained(size, run_pipeline)
+        yield one_process(size, run_pipeline)
     else:
         raise ValueError(f"no group {group!r}; groups: {', '.join(GROUPS)}")
 
@@ -183,31 +194,21 @@ def _differing(a: Message, b: Message) -> int:
 # --- solve ---
 
 
-class _Recorder(Estimator):
-    """Keeps the rows and fits that went into the window."""
-
-    def __init__(self, settings: Settings) -> None:
-        super().__init__(settings, RIG)
-        self.rows: list[tuple[Rows, Fit]] = []
-
-    def _add_flow(self, t_ns: int, rows: Rows, on_error: Rows, predicted: tuple[F64, F64] | None) -> None:
-        super()._add_flow(t_ns, rows, on_error, predicted)
-        fit = self._fit(t_ns, on_error)
-        if fit is not None:
-            self.rows.append((rows, fit))
-
-
 def window(size: Size) -> Case:
-    """``solve.window``: a batch taken in by a full window, all in: rows, fit, compression, inertial factors, solution
-    and covariance; against normal equations of all rows of the window by dense numpy, which lack the IMU."""
+    """``solve.window``: a batch taken in by a full window, all in.
+
+    Rows, fit, compression, inertial factors, solution and covariance; against normal equations of all rows of the
+    window by dense numpy, which lack the IMU.
+    """
     warm = size.window + size.window // 4
     stream = list(bench_input.estimates(warm + size.repeats + 1, size.flows, seed=3))
-    recorder, estimator = _Recorder(Settings()), Estimator(Settings(), RIG)
+    # The peer stays in the window at which ``run`` begins.
+    still, estimator = Estimator(Settings(), RIG), Estimator(Settings(), RIG)
     for imu, flow, depth in stream[:warm]:
-        for e in (recorder, estimator):
+        for e in (still, estimator):
             e.add_imu(imu)
             e.absorb(flow, depth)
-        del recorder.rows[: -size.window]
+    batches = [_rows(flow, depth) for _, flow, depth in stream[warm - size.window : warm]]
     ahead = iter(stream[warm:])
 
     def run() -> None:
@@ -216,7 +217,7 @@ def window(size: Size) -> Case:
         estimator.absorb(flow, depth)
 
     def run_peer() -> tuple[F64, F64]:
-        H, h = dense_normal_equations(recorder, recorder.rows)
+        H, h = dense_normal_equations(still.window, batches)
         # The IMU's factors, which determine the other states, cost the peer nothing.
         H[np.diag_indices_from(H)] += 1.0
         cov: F64 = np.asarray(np.linalg.inv(H), np.float64)
@@ -224,30 +225,42 @@ def window(size: Size) -> Case:
 
     def disagreement() -> float:
         """Of one batch's information, relative: compression takes the spline as constant over 5 ms."""
-        rows, fit = recorder.rows[-1]
-        H, _ = dense_normal_equations(recorder, [(rows, fit)])
+        rows, fit = batches[-1]
+        H, _ = dense_normal_equations(still.window, batches[-1:])
         compressed = np.zeros_like(H)
         for info in compress(rows, fit, BIN_NS, 1e-9, 1.0):
-            at = recorder.window.selector(info.t_ns)[_V_AND_BW]
+            at = still.window.selector(info.t_ns)[_V_AND_BW]
             compressed += at.T @ info.L @ at
         return float(np.abs(compressed - H).max() / np.abs(H).max())
 
     return Case("solve.window", run, 1, "dense numpy of all rows", run_peer, 1, disagreement, slow=True)
 
 
-def dense_normal_equations(estimator: Estimator, batches: list[tuple[Rows, Fit]]) -> tuple[F64, F64]:
+def _rows(flow: FlowBatch, depth: DepthBatch) -> tuple[Rows, Fit]:
+    """A batch of ``bench_input.estimates`` as rows on v_B with robust weights; camera and IMU are one."""
+    camera = (RIG.left.fx, RIG.left.cx, RIG.left.cy)
+    a_B, b_B = body_rows((flow.x, flow.y), flow.n, depth.inv_depth, camera, np.eye(3), np.zeros(3))
+    t_ns = flow.t_ns - flow.age.astype(np.int64)
+    rows = on_velocity(t_ns, flow.speed.astype(np.float64), a_B, b_B, np.zeros_like(b_B))
+    rows.sigma[:] = flow.sigma
+    fit = solve(rows, Settings().optimizer.ransac_iterations, seed=1)
+    assert fit is not None, "the rows of the made-up input determine a velocity"
+    return rows, fit
+
+
+def dense_normal_equations(states: Window, batches: list[tuple[Rows, Fit]]) -> tuple[F64, F64]:
     """H (n, n) and h (n,) of all rows on the states of the window, one row of J (m, n) per flow."""
     t_ns, z, a, b = (np.concatenate([getattr(r, name) for r, _ in batches]) for name in ("t_ns", "z", "a", "b"))
     w = np.concatenate([fit.weight / (rows.sigma * fit.scale) ** 2 for rows, fit in batches])
     knot_ns = int(Settings().optimizer.knot_s * NS_PER_S)
     segment = t_ns // knot_ns
-    J = np.zeros((len(z), estimator.window.size))
-    for k in range(estimator.window.first, estimator.window.last + 1):
+    J = np.zeros((len(z), states.size))
+    for k in range(states.first, states.last + 1):
         here = np.flatnonzero(segment == k)
         weights = _basis((t_ns[here] - k * knot_ns) / knot_ns)
-        for column, weight in zip(estimator.window.control_columns(k), weights, strict=True):
+        for column, weight in zip(states.control_columns(k), weights, strict=True):
             J[here, column : column + 3] = weight[:, None] * a[here]
-        J[np.ix_(here, estimator.window.bias_columns(k)[3:])] = -b[here]
+        J[np.ix_(here, states.bias_columns(k)[3:])] = -b[here]
     weighted = J * w[:, None]
     return weighted.T @ J, weighted.T @ z
 
@@ -308,10 +321,10 @@ def _batch_packets(size: Size) -> Iterator[tuple[EventPacket, EventPacket]]:
                 yield pair[0], pair[1]
 
 
-def sustained(size: Size, run_pipeline: RunPipeline) -> Case:
-    """``pipeline.sustained``: the stages chained on a whole stream; a unit is a batch.
+def one_process(size: Size, run_pipeline: RunPipeline) -> Case:
+    """``pipeline.one_process``: the stages chained on a whole stream, without network; a unit is a batch.
 
-    ``mev_s`` counts the events of both cameras. What chains the stages decides whether messages travel between.
+    ``mev_s`` counts the events of both cameras.
     """
     packets = list(bench_input.packets(size.seconds, seed=1))
     events = sum(len(p.x) for p in packets if isinstance(p, EventPacket))
@@ -322,7 +335,7 @@ def sustained(size: Size, run_pipeline: RunPipeline) -> Case:
         run_pipeline(_noting_the_start(packets, started_ns))
         return time.perf_counter_ns() - started_ns[0]
 
-    return Case("pipeline.sustained", run, per=batches, events=events, clocked=True)
+    return Case("pipeline.one_process", run, per=batches, events=events, clocked=True)
 
 
 def _noting_the_start(packets: list[EventPacket | ImuPacket], started_ns: list[int]) -> Packets:

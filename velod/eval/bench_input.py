@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from velod.geometry.calibration import Calibration, Camera
 from velod.geometry.camera import motion_field_rows
 from velod.geometry.rectify import rectify
+from velod.io.model import EventColumns, Imu
+from velod.io.sequence import RecordingWriter
 from velod.types import F64, NS_PER_S, DepthBatch, EventPacket, FlowBatch, ImuPacket, ImuSamples
 
 CAMERA = Camera(width=346, height=260, fx=231.5, fy=231.5, cx=172.5, cy=129.5)
@@ -76,6 +79,19 @@ def packets(seconds: float, seed: int) -> Iterator[EventPacket | ImuPacket]:
         for camera, e in sides.items():
             part = slice(*np.searchsorted(e.t_ns, [start, end]).tolist())
             yield EventPacket(seq, end, camera, e.x[part], e.y[part], e.t_ns[part], e.p[part])
+
+
+def record(path: Path, seconds: float, seed: int) -> int:
+    """Write the stream of ``packets`` as a recording; returns the number of events of both cameras."""
+    written = 0
+    with RecordingWriter(path, RIG) as writer:
+        for side, shift_px in (("left", 0.0), ("right", DISPARITY_PX)):
+            e = events(seconds, shift_px, seed)
+            writer.append(side, EventColumns(t_ns=e.t_ns, x=e.x, y=e.y, p=e.p))
+            written += len(e.t_ns)
+        t_ns = np.arange(0, int(seconds * NS_PER_S), IMU_NS, dtype=np.int64)
+        writer.finish(Imu(t_ns, *_at_rest(len(t_ns), np.random.default_rng(seed))))
+    return written
 
 
 def estimates(
