@@ -154,7 +154,7 @@ class OptimizerSettings:
     )
     fixed_sigma_px_s: float = _f(20.0, "sigma of a flow residual with weights = 'fixed', px/s", above=0.0, hi=1e4)
     shared_error: float = _f(
-        5.0, "information of a batch is divided by this for errors its flows share", lo=1.0, hi=100.0
+        10.0, "information of a batch is divided by this for errors its flows share", lo=1.0, hi=100.0
     )
     ransac_iterations: int = _f(64, "minimal samples of the linear solver (Eq. 15)", lo=8, hi=10_000)
     min_flows: int = _f(12, "flows with a depth that a batch must have", lo=6, hi=10_000)

@@ -173,7 +173,7 @@ def test_a_batch_that_does_not_fit_the_calibration_is_dropped_and_counted(wrong:
 
 
 def test_a_match_that_refinement_could_have_confirmed_and_did_not_is_dropped() -> None:
-    """The right camera sees the edge with the other polarity only: block matching, which sees no polarity, matches."""
+    """The right camera has the edge in the other polarity: block matching, which sees no polarity, matches."""
     message = batch(Edge())
     message = replace(message, right=message.right[::-1].copy())
     strict, counters = run(message)

@@ -4,7 +4,18 @@ import numpy as np
 
 from velod.geometry.camera import motion_field_rows
 from velod.geometry.so3 import exp
-from velod.optimizer.flow_equation import Rows, body_rows, compress, on_error, on_velocity, pairs, sigmas, solve
+from velod.optimizer.flow_equation import (
+    Measured,
+    Rows,
+    body_rows,
+    compress,
+    on_error,
+    on_velocity,
+    pairs,
+    sigmas,
+    solve,
+    solve_weighted,
+)
 
 
 def rows_of(v, b_w, rng, m=200, outliers=0.0, sigma=2.0):
@@ -99,11 +110,39 @@ def test_the_rows_of_a_displaced_and_turned_camera_are_differences_of_its_flow()
     assert np.allclose(a @ v_B + b @ w_B, n @ flow, rtol=1e-5)
 
 
+def measured(speed, translational):
+    one = np.ones(1)
+    return Measured(speed * one, 0.03 * speed * one, translational * one, 0.1 * one)
+
+
 def test_the_depths_sigma_counts_with_the_translational_flow():
-    one, f4 = np.ones(1, np.float32), np.float32
-    far = sigmas(one, np.array([0.5], f4), np.array([0.05], f4), np.array([0.0]))
-    near = sigmas(one, np.array([0.5], f4), np.array([0.05], f4), np.array([100.0]))
-    assert np.isclose(near[0] ** 2 - far[0] ** 2, 10.0**2, rtol=1e-5)
+    far, near = (sigmas(measured(100.0, t), np.zeros(1)) for t in (0.0, 100.0))
+    assert np.isclose(near[0] ** 2 - far[0] ** 2, 10.0**2)
+
+
+def test_a_flow_that_came_out_too_fast_has_the_sigma_of_the_flow_that_it_should_have_been():
+    too_fast = sigmas(measured(120.0, 70.0), np.full(1, 20.0))
+    right = sigmas(measured(100.0, 50.0), np.zeros(1))
+    assert np.isclose(too_fast[0], right[0])
+
+
+def test_weights_that_follow_the_noise_of_the_flow_would_bias_the_velocity():
+    """The reason for the second fit: 6 % noise on every flow, and a sigma proportional to what was measured."""
+    rng = np.random.default_rng(0)
+    v, m = np.array([2.0, 1.0, -1.0]), 4000
+    a = rng.normal(size=(m, 3)) * 80
+    true = a @ v
+    a, true = a * np.sign(true)[:, None], np.abs(true)
+    keep = true > 30
+    a, true = a[keep], true[keep]
+    speed = true * (1 + 0.06 * rng.normal(size=len(true)))
+    said = Measured(speed, 0.06 * speed, speed, np.full(len(true), 1e-3))
+
+    rows = Rows(np.arange(len(true)), speed, a, np.zeros_like(a), sigmas(said, np.zeros(len(true))))
+    naive = solve(rows, 64, 1).e @ v / (v @ v) - 1
+    second = solve_weighted(rows, said, 64, 1).e @ v / (v @ v) - 1
+    assert naive < -0.003
+    assert abs(second) < 0.002
 
 
 def test_pairs_are_the_intersection_of_both_indices():

@@ -11,7 +11,7 @@ from velod.config import Settings
 from velod.geometry.calibration import Calibration
 from velod.geometry.rectify import rectify
 from velod.optimizer import flow_equation, inertial_residual
-from velod.optimizer.flow_equation import Fit, Rows
+from velod.optimizer.flow_equation import Fit, Measured, Rows
 from velod.optimizer.inertial import InertialMemory
 from velod.optimizer.preintegration import Preintegration, preintegrate
 from velod.optimizer.window import Window
@@ -131,7 +131,7 @@ class Estimator:
         M = np.ascontiguousarray(R[0].T)
         return R[0], M @ s[0], M
 
-    def _rows(self, flow: FlowBatch, depth: DepthBatch) -> tuple[Rows, Rows] | None:
+    def _rows(self, flow: FlowBatch, depth: DepthBatch) -> tuple[Rows, Rows, Measured] | None:
         """Rows of the flow equation where flow and depth speak of the same event: on the spline, and on e."""
         at_flow, at_depth = flow_equation.pairs(flow.index, depth.index)
         t = flow.t_ns - flow.age[at_flow].astype(np.int64)
@@ -146,21 +146,26 @@ class Estimator:
         )
         R_LB, s_L, w_B = self.memory.at(t)
         # Eq. 4: |x_n| - n^T B w = (n^T A / Z) v
-        on_velocity = flow_equation.on_velocity(t, flow.speed[at_flow].astype(np.float64), a_B, b_B, w_B)
-        if self._o.weights == "fixed":
-            on_velocity.sigma[:] = self._o.fixed_sigma_px_s
-        else:
-            on_velocity.sigma[:] = flow_equation.sigmas(
-                flow.sigma[at_flow], inv_depth, depth.sigma[at_depth], on_velocity.z
-            )
+        speed = flow.speed[at_flow].astype(np.float64)
+        on_velocity = flow_equation.on_velocity(t, speed, a_B, b_B, w_B)
+        measured = Measured(
+            speed, flow.sigma[at_flow].astype(np.float64), on_velocity.z.copy(), depth.sigma[at_depth] / inv_depth
+        )
         on_error = flow_equation.on_error(on_velocity, R_LB, s_L)
-        return on_error if self._o.spline == "error" else on_velocity, on_error
+        return on_error if self._o.spline == "error" else on_velocity, on_error, measured
 
-    def _fit(self, t_ns: int, on_error: Rows) -> Fit | None:
-        """The batch's own solution for e at ``t_ns``: gravity, which e holds, is taken from what is known of it."""
+    def _fit(self, t_ns: int, on_error: Rows, measured: Measured) -> Fit | None:
+        """The batch's own solution for e at ``t_ns``: gravity, which e holds, is taken from what is known of it.
+
+        The sigmas of the rows are set on the way.
+        """
         dt = (on_error.t_ns - t_ns) * 1e-9
         still = replace(on_error, z=on_error.z + (on_error.a @ self._gravity()) * dt)
-        return flow_equation.solve(still, self._o.ransac_iterations, self._o.seed + t_ns // 1000)
+        iterations, seed = self._o.ransac_iterations, self._o.seed + t_ns // 1000
+        if self._o.weights == "fixed":
+            still.sigma[:] = self._o.fixed_sigma_px_s
+            return flow_equation.solve(still, iterations, seed)
+        return flow_equation.solve_weighted(still, measured, iterations, seed)
 
     def _start(self, t_ns: int) -> None:
         self.window.start(t_ns)
@@ -200,8 +205,10 @@ class Estimator:
         blocks, r, information = inertial_residual.linearise(p, R_LBi, (N_i, M_i), (N_j, M_j), v_j)
         return self.window.between(t_i, t_j, blocks), r, information
 
-    def _add_flow(self, t_ns: int, rows: Rows, on_error: Rows, predicted: tuple[F64, F64] | None) -> None:
-        fit = self._fit(t_ns, on_error)
+    def _add_flow(
+        self, t_ns: int, rows: Rows, on_error: Rows, measured: Measured, predicted: tuple[F64, F64] | None
+    ) -> None:
+        fit = self._fit(t_ns, on_error, measured)
         if fit is None:
             self._count("batch.undetermined")
             return

@@ -20,6 +20,8 @@ from velod.events.columns import readonly
 from velod.geometry.camera import motion_field_rows
 from velod.types import F32, F64, I64, U16
 
+PREDICTED_SHARE = (0.3, 3.0)
+"""Bounds on predicted over measured flow where a sigma is scaled by it."""
 MODEL_SIGMA_PX_S = 2.0
 """Flow error that neither fit nor depth accounts for (DESIGN 5.5)."""
 
@@ -33,6 +35,16 @@ class Rows:
     a: F64  # (m, 3) px/m
     b: F64  # (m, 3) px
     sigma: F64  # (m,) px/s
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """What the sigma of a row follows from, (m,) each."""
+
+    speed: F64  # normal flow, px/s
+    sigma: F64  # of speed, px/s
+    translational: F64  # speed less what rotation explains, px/s
+    depth_share: F64  # sigma of the inverse depth as a share of it
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,10 +86,16 @@ def body_rows(
     return a_B, b_B
 
 
-def sigmas(speed_sigma: F32, inv_depth: F32, inv_depth_sigma: F32, translational: F64) -> F64:
-    """Standard deviation of a row, px/s, (m,): fit, model, and the depth's share of the translational flow."""
-    from_depth = translational * inv_depth_sigma / inv_depth
-    return np.sqrt(speed_sigma.astype(np.float64) ** 2 + MODEL_SIGMA_PX_S**2 + from_depth**2)
+def sigmas(measured: Measured, residual: F64) -> F64:
+    """Standard deviation of a row, px/s, (m,): fit, model, and the depth's share of the translational flow.
+
+    They are those of the flow that a velocity predicts, the measured one less ``residual`` (m,): a weight that
+    follows the measured speed would believe slow flows more than fast ones, and bias the velocity.
+    """
+    predicted_share = np.clip((measured.speed - residual) / measured.speed, *PREDICTED_SHARE)
+    from_fit = measured.sigma * predicted_share
+    from_depth = (measured.translational - residual) * measured.depth_share
+    return np.sqrt(from_fit**2 + MODEL_SIGMA_PX_S**2 + from_depth**2)
 
 
 def on_velocity(t_ns: I64, speed: F64, a_B: F64, b_B: F64, w_B: F64) -> Rows:
@@ -114,6 +132,19 @@ def solve(rows: Rows, iterations: int, seed: int) -> Fit | None:
     if m < 3 or not _solve(rows.a, rows.z, rows.sigma, iterations, seed & 0x7FFFFFFF, weight, e, cov, stats):
         return None
     return Fit(e, cov, weight, float(stats[0]), float(stats[1]))
+
+
+def solve_weighted(rows: Rows, measured: Measured, iterations: int, seed: int) -> Fit | None:
+    """``solve`` with the sigmas of ``measured``, then with those of the flow that the first solution predicts.
+
+    The sigmas are set in ``rows``, in place.
+    """
+    rows.sigma[:] = sigmas(measured, np.zeros_like(rows.z))
+    first = solve(rows, iterations, seed)
+    if first is None:
+        return None
+    rows.sigma[:] = sigmas(measured, rows.z - rows.a @ first.e)
+    return solve(rows, iterations, seed)
 
 
 def compress(rows: Rows, fit: Fit, bin_ns: int, gyro_noise: float, shared_error: float) -> list[Information]:
