@@ -21,7 +21,7 @@ from velod.eval import bench_input
 from velod.eval.bench import Case, Size
 from velod.eval.bench_input import RIG
 from velod.events.plane_fit import SIZE
-from velod.events.sae import NEVER, new_surface, update_sae
+from velod.events.sae import new_surface, update_sae
 from velod.flow.stage import FlowStage
 from velod.ingest.stage import IngestStage
 from velod.optimizer.estimator import BIN_NS, Estimator
@@ -92,10 +92,13 @@ def sae(size: Size) -> Case:
     n = min(size.events, len(e.t_ns))
     h, w = RIG.left.height, RIG.left.width
     first, last = new_surface(h, w), new_surface(h, w)
+    x, y, t_ns, p = e.x[:n], e.y[:n], e.t_ns[:n].copy(), e.p[:n]
+    lap_ns = int(t_ns[-1] - t_ns[0]) + 1
 
     def run() -> None:
-        last[:] = NEVER
-        update_sae(e.x[:n], e.y[:n], e.t_ns[:n], e.p[:n], first, last, 10_000_000)
+        # The same events over and over, each time later.
+        np.add(t_ns, lap_ns, out=t_ns)
+        update_sae(x, y, t_ns, p, first, last, 10_000_000)
 
     return Case("events.sae", run, per=n)
 
