@@ -322,7 +322,7 @@ def _add_eval(commands: _Commands[argparse.ArgumentParser]) -> None:
         choices=("synthetic",),
         help="simulate the sequences of Table I (kept) and judge velod and its baselines beside the paper",
     )
-    parser.add_argument("--quick", action="store_true", help="with --table: one second of each, one IMU noise")
+    parser.add_argument("--quick", action="store_true", help="with --table: a second of each, one IMU noise")
     parser.add_argument("--report", metavar="DIR", help="compare with the baselines; write report.html and pictures")
 
 

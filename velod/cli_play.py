@@ -185,10 +185,22 @@ def _floor_mps(config: str | None, played: Played) -> float | None:
     return floor_mps(settings_of(config), played.recording)
 
 
+def _drift_percent(played: Played) -> float | None:
+    """Of dead reckoning, relative to the distance; None without a truth or without two velocities."""
+    from velod.eval.dead_reckoning import dead_reckoning
+
+    recording = played.recording
+    if recording.truth is None:
+        return None
+    track = dead_reckoning(played.velocities, recording.imu, recording.truth)
+    return None if track is None else track.drift_percent
+
+
 def result_row(played: Played, metrics: Metrics, floor_mps: float | None = None) -> dict[str, float | int | None]:
     """One result as ``--json`` writes it; what is not known is null."""
     return metrics.row(
         ave_floor_mps=floor_mps,
+        drift_percent=_drift_percent(played),
         real_time_factor=played.real_time_factor,
         latency_p50_ms=played.latency_p50_ms,
         latency_p99_ms=played.latency_p99_ms,
@@ -204,6 +216,9 @@ def summary(played: Played, metrics: Metrics | None, floor_mps: float | None = N
         f"{played.real_time_factor:.2f} x real time"
     ]
     lines.append(metrics.summary() if metrics is not None else _without_truth(played))
+    drift_percent = _drift_percent(played)
+    if drift_percent is not None:
+        lines.append(f"drift          {drift_percent:8.2f} %     (of the distance, by dead reckoning)")
     if floor_mps is not None:
         lines.append(f"floor          {floor_mps:8.4f} m/s   (AVE with perfect flow and depth)")
     if math.isfinite(played.rate_hz):

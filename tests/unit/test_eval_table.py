@@ -11,7 +11,8 @@ import pytest
 from velod.eval.compare import METHODS, Judged, Judgement, judge
 from velod.eval.metrics import evaluate
 from velod.eval.paper import PAPER, TABLE_IV_MS
-from velod.eval.table import Row, as_json, ave_table, detail_table, notes, rve_table, spread, text_table
+from velod.eval.stage_errors import StageErrors
+from velod.eval.table import Row, as_json, ave_table, detail_table, notes, rve_table, spread, stage_table, text_table
 from velod.io.model import Imu, Truth
 from velod.types import Velocity
 
@@ -137,3 +138,16 @@ def test_every_method_has_a_column_and_an_explanation() -> None:
 def test_judging_agrees_with_the_metrics_of_velod_eval() -> None:
     velocities = off_by(0.1)
     assert judge(velocities, IMU, TRUTH, 0).metrics == evaluate(velocities, TRUTH, 0)
+
+
+def test_stage_errors_are_shown_in_percent_and_pixels_and_a_dash_where_there_is_no_truth() -> None:
+    errors = StageErrors(1000, -0.002, 0.03, 0.001, 0.9, 800, 0.0031, 0.04, 0.02, math.nan)
+    one = {"velod": [judged(0.1)]}
+    rows = [Row("a", 1.0, one, stages=errors), Row("b", 1.0, one)]
+    table = stage_table(rows)
+    assert table[1] == ["a", "1000", "-0.20", "3.00", "0.10", "0.90", "800", "0.003", "0.040", "2.00", "nan"]
+    assert set(table[2][1:]) == {"-"}
+    first, second = as_json(rows, [])["sequences"]
+    assert first["stages"]["flow_bias"] == -0.002
+    assert first["stages"]["disparity_sigmas"] is None
+    assert second["stages"] is None

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
 from velod.eval.compare import METHODS, Judged, Judgement
 from velod.eval.paper import PAPER
+from velod.eval.stage_errors import StageErrors
 
 NONE_VALID = "*"
 REAL = "r"
@@ -52,6 +53,7 @@ class Row:
     judgement: Judgement
     imu_seconds: float = math.nan  # length of the longer integration of the IMU
     imu_long: tuple[Judged, ...] = ()
+    stages: StageErrors | None = None  # of velod's front end, where the truth of it is known
 
     def ave(self, method: str) -> Spread:
         return spread(j.metrics.ave_mps for j in self.judgement.get(method, ()))
@@ -105,6 +107,26 @@ def detail_table(rows: Sequence[Row]) -> list[list[str]]:
                 *(row.drift(m).text() for m in ("velod", "paper-like", "linear", "IMU")),
             ]
         )
+    return lines
+
+
+def stage_table(rows: Sequence[Row]) -> list[list[str]]:
+    """How far normal flow and disparity are from the simulator's truth; robust measures, sigmas in stated ones."""
+    head = [
+        *("sequence", "flows", "bias %", "spread %", "outliers %", "sigmas"),
+        *("disparities", "bias px", "MAD px", "wrong %", "sigmas"),
+    ]
+    lines = [head]
+    for row in rows:
+        s = row.stages
+        if s is None:
+            lines.append([row.name, *("-" for _ in head[1:])])
+            continue
+        flow = (100.0 * s.flow_bias, 100.0 * s.flow_spread, 100.0 * s.flow_outliers, s.flow_sigmas)
+        disparity = (s.disparity_bias_px, s.disparity_mad_px, 100.0 * s.disparity_wrong, s.disparity_sigmas)
+        of_flow = [f"{v:.2f}" for v in flow]
+        of_disparity = [*(f"{v:.3f}" for v in disparity[:2]), *(f"{v:.2f}" for v in disparity[2:])]
+        lines.append([row.name, str(s.flows), *of_flow, str(s.disparities), *of_disparity])
     return lines
 
 
@@ -165,7 +187,9 @@ def _row_json(row: Row) -> dict[str, Any]:
                 "rve_percent": _spread_json(row.rve(method)),
                 "drift_percent": _spread_json(row.drift(method)),
                 "ever_valid": all(j.ever_valid for j in runs),
-                "runs": [j.metrics.row() for j in runs],
+                "runs": [
+                    j.metrics.row(drift_percent=None if j.track is None else j.track.drift_percent) for j in runs
+                ],
             }
             for method, runs in row.judgement.items()
         },
@@ -176,6 +200,9 @@ def _row_json(row: Row) -> dict[str, Any]:
             "ave_mps": _spread_json(spread(j.metrics.ave_mps for j in row.imu_long)),
             "rve_percent": _spread_json(spread(j.metrics.rve_percent for j in row.imu_long)),
         },
+        "stages": None
+        if row.stages is None
+        else {name: value if math.isfinite(value) else None for name, value in asdict(row.stages).items()},
         "paper": None
         if paper is None
         else {
