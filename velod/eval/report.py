@@ -106,7 +106,7 @@ class Report:
         return path
 
     def _table_iv(self) -> list[list[str]]:
-        head = ["", "preprocessing", "flow", "depth", "flow and depth", "back end", "overall"]
+        head = ["", "preprocessing, with reading the file", "flow", "depth", "flow and depth", "back end", "overall"]
         lines = [head]
         for name, t in self._times:
             both = t.flow_ms + t.depth_ms

@@ -71,7 +71,7 @@ class Row:
 
 def ave_table(rows: Sequence[Row]) -> list[list[str]]:
     """AVE of every method, m/s; the first line is the head."""
-    head = ["sequence", "s", *METHODS, "IMU, s", "IMU long", "paper: ours", "IMU", "Benosman-NF", "in"]
+    head = ["sequence", "s", *METHODS, "IMU, s", "IMU long", "paper: ours", "paper: IMU", "paper: Ben.", "in"]
     return [head, *(_ave_line(row) for row in rows)]
 
 
