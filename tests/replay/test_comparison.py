@@ -60,6 +60,16 @@ def test_the_page_holds_everything_and_asks_for_nothing_else(compared: Path) -> 
         assert any(p.stem.endswith(picture) for p in compared.glob("*.png"))
 
 
+def test_the_page_says_where_the_time_goes(compared: Path) -> None:
+    page = (compared / "report.html").read_text()
+    rows = re.findall(r"<tr><td>boxes-4[^<]*</td>((?:<td>-?[0-9.]+</td>){6})</tr>", page)
+    milliseconds = [float(t) for t in re.findall(r">(-?[0-9.]+)<", rows[-1])]
+    preprocessing, flow, depth, both, back_end, overall = milliseconds
+    assert min(preprocessing, flow, depth, back_end) > 0.0
+    assert both == pytest.approx(flow + depth, abs=0.11)
+    assert overall == pytest.approx(preprocessing + both + back_end, abs=0.21)
+
+
 def test_a_recording_without_truth_cannot_be_compared(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     assert main(["eval", str(tmp_path / "missing.h5"), "--report", str(tmp_path)]) == 2
     assert "no such file" in capsys.readouterr().err
