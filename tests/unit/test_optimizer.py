@@ -102,7 +102,7 @@ def test_a_late_batch_is_taken_in_within_the_window():
     rest = [m for m in stream if not (isinstance(m, FlowBatch) and 20 <= m.seq < 30)]
     at = next(i for i, m in enumerate(rest) if isinstance(m, FlowBatch) and m.seq == 40)
     velocities, stage = run([*rest[:at], *late, *rest[at:]], max_wait_ms=30.0)
-    assert stage.counters["batch.late"] == 10
+    assert stage.counters["late.taken_in"] == 10
     assert "batch.lost" not in stage.counters
     assert errors(velocities, FLIGHT).mean() < 0.06
 
@@ -173,7 +173,7 @@ def test_imu_samples_that_go_back_in_time_are_counted_and_dropped():
 def test_a_batch_with_few_flows_is_counted():
     few = messages(FLIGHT, 0.3, flows=8)
     velocities, stage = run(few)
-    assert stage.counters["batch.few_flows"] == 20
+    assert stage.counters["fit.few_flows"] == 20
     assert not any(v.valid for v in velocities)
 
 

@@ -138,7 +138,7 @@ class Estimator:
         inside = (t >= self.memory.t_ns[0]) & (self.window.empty | (t >= self.window.first * self._knot_ns))
         at_flow, at_depth, t = at_flow[inside], at_depth[inside], t[inside]
         if len(t) < self._o.min_flows:
-            self._count("batch.few_flows")
+            self._count("fit.few_flows")
             return None
         inv_depth = depth.inv_depth[at_depth]
         a_B, b_B = flow_equation.body_rows(
@@ -210,13 +210,13 @@ class Estimator:
     ) -> None:
         fit = self._fit(t_ns, on_error, measured)
         if fit is None:
-            self._count("batch.undetermined")
+            self._count("fit.undetermined")
             return
         shared = self._o.shared_error
         if predicted is not None:
             shared *= max(1.0, self._innovation(t_ns, fit, predicted) / INNOVATION_GATE)
         if shared > self._o.shared_error:
-            self._count("batch.inconsistent")
+            self._count("fit.inconsistent")
         for info in flow_equation.compress(rows, fit, BIN_NS, self._imu.gyro_noise, shared):
             self.window.add_information(info.t_ns, info.L, info.eta)
         self.batches += 1

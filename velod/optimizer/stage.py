@@ -219,7 +219,7 @@ class OptimizerStage:
             return
         head = self._estimator.head
         if head is not None and flow.t_ns < head.t_ns:
-            self._count("batch.late")
+            self._count("late.taken_in")
             if not self._estimator.window.contains(flow.t_ns):
                 self._count("batch.too_late")
                 return
