@@ -3,17 +3,16 @@
 import numpy as np
 import pytest
 
-from velod.config import ImuSettings, Settings
-from velod.geometry.calibration import Calibration, Camera
+from tests.synthetic import CALIBRATION, FLIGHT, messages
+from velod.config import ImuSettings, Settings, from_tree
 from velod.geometry.so3 import exp, hat
 from velod.optimizer.estimator import Estimator, Head
 from velod.optimizer.preintegration import preintegrate
+from velod.optimizer.stage import OptimizerStage
 from velod.optimizer.window import HEAD, Window
 from velod.types import ImuSamples
 
 KNOT_NS = 100_000_000
-CAMERA = Camera(346, 260, 231.5, 231.5, 172.3, 130.8)
-CALIBRATION = Calibration(CAMERA, CAMERA, np.eye(3), np.array([-0.12, 0.0, 0.0]))
 
 
 def filled(segments, rng):
@@ -246,3 +245,29 @@ def test_the_covariance_carried_by_the_imu_is_that_of_its_jacobian(estimator):
     p = preintegrate(e.memory.t_ns, e.memory.accel, e.memory.gyro, head.t_ns, t, head.b_a, head.b_w, 1.86e-2, 1.86e-3)
     N = np.hstack([hat(v), p.R_gamma.T])
     assert np.allclose(cov, from_head + N @ p.cov @ N.T, rtol=1e-5, atol=1e-12)
+
+
+def test_counting_the_spline_from_another_origin_moves_it_and_nothing_else():
+    w, t = filled(4, np.random.default_rng(5)), int(11.7 * KNOT_NS)
+    F = w.selector(t)
+    x = w.solve([], None, 0.0)
+    before, P = F @ x.x, x.cov(F)
+    w.shift(np.array([300.0, -20.0, 5.0]))
+    y = w.solve([], None, 0.0)
+    assert np.allclose((F @ y.x)[:3] - before[:3], [300.0, -20.0, 5.0], atol=1e-6)
+    assert np.allclose((F @ y.x)[3:], before[3:], atol=1e-5)
+    assert np.allclose(y.cov(F), P)
+
+
+def test_an_estimate_does_not_notice_that_the_integrated_velocity_is_counted_anew(monkeypatch):
+    def final(limit):
+        monkeypatch.setattr("velod.optimizer.estimator.MAX_INTEGRATED", limit)
+        stage = OptimizerStage(from_tree({}), CALIBRATION)
+        velocities = [v for m in messages(FLIGHT, 1.0) for v in stage.handle(m)]
+        return np.array([v.v_B for v in velocities]), stage._estimator.memory.at(np.array([velocities[-1].t_ns - 1]))[
+            1
+        ]
+
+    (often, s_often), (never, s_never) = final(1.0), final(1e9)
+    assert np.linalg.norm(s_often) < 2.0 < np.linalg.norm(s_never)
+    assert np.abs(often - never).max() < 1e-7

@@ -23,6 +23,8 @@ SMOOTHNESS = {"error": 0.5, "velocity": 5.0}
 """Weak sigma of the second difference of control points, m/s, by what the spline models."""
 INNOVATION_GATE = 25.0
 """Squared Mahalanobis distance from which a batch that contradicts the prediction loses weight (5 sigma)."""
+MAX_INTEGRATED = 1000.0
+"""m/s; s_L, which gravity makes grow without end, is counted anew beyond this."""
 MAX_CARRIED = 32
 """Predictions of one head that are remembered: a batch asks for some of them twice."""
 MAX_DIRECTION_SIGMA = 0.5
@@ -98,6 +100,7 @@ class Estimator:
         if rows is not None:
             self._add_flow(flow.t_ns, *rows, predicted)
         self._solve_head(self.head.t_ns if late and self.head is not None else flow.t_ns)
+        self._keep_error_small()
 
     def predict(self, t_ns: int) -> tuple[F64, F64] | None:
         """v_B (3,) and its covariance (3, 3) at ``t_ns``, carried there from the head by the IMU (Eq. 10)."""
@@ -228,6 +231,14 @@ class Estimator:
         d = R[0].T @ (s_L[0] + fit.e) - predicted[0]
         S = R[0].T @ fit.cov @ R[0] * self._o.shared_error + predicted[1]
         return float(d @ np.linalg.solve(S, d))
+
+    def _keep_error_small(self) -> None:
+        """Take from s_L what gravity has added to it, before the solution loses digits to it."""
+        if self._o.spline == "error" and self.head is not None:
+            _, s_L, _ = self.memory.at(np.array([self.head.t_ns]))
+            if np.linalg.norm(s_L[0]) > MAX_INTEGRATED:
+                self.memory.shift(-s_L[0])
+                self.window.shift(s_L[0])
 
     def _solve_head(self, t_ns: int) -> None:
         """Optimum of the window and the state at ``t_ns``, with the IMU of the last incomplete interval."""

@@ -83,6 +83,10 @@ class InertialMemory:
         )
         return R, s, w
 
+    def shift(self, offset: F64) -> None:
+        """Count s_L from another origin: s_L + offset."""
+        self._s[: self._n_integrated] += offset
+
     def _forget(self) -> None:
         keep_from = int(np.searchsorted(self.t_ns, self._t[self._n - 1] - self._memory_ns)) if self._n else 0
         keep_from = max(0, min(keep_from, self._n_integrated - 1))

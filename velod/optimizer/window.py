@@ -170,6 +170,15 @@ class Window:
         columns = np.array([*self.control_columns(segment), bias])
         _add_information(self._H, self._h, self._end, columns, basis(u), L, eta)
 
+    def shift(self, offset: F64) -> None:
+        """Count the spline from another origin: every control point + offset (3,); the information is the same."""
+        n = self.size
+        change = np.zeros(n)
+        for segment in range(self.first, self.last + 1):
+            for column in self.control_columns(segment):
+                change[column : column + 3] = offset
+        self._h[:n] += self._H[:n, :n] @ change
+
     def solve(self, extra: list[tuple[F64, F64, F64]], g_prior: F64 | None, g_sigma: float) -> Solution:
         """The optimum with further factors (J, r, information) that are not kept.
 
