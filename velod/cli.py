@@ -71,6 +71,8 @@ def _eval(args: argparse.Namespace) -> int:
         raise ValueError("--table simulates its own recordings: give it or files, not both")
     if args.quick and (args.files or args.table is None):
         raise ValueError("--quick goes with --table synthetic")
+    if args.table is not None and args.calibration is not None:
+        raise ValueError("--calibration goes with recordings: --table simulates its own")
     if args.table is not None:
         from velod.cli_compare import compare_sequences
 
@@ -80,7 +82,7 @@ def _eval(args: argparse.Namespace) -> int:
     if args.report is not None:
         from velod.cli_compare import compare_files
 
-        return compare_files(args.config, args.files, args.json, args.report)
+        return compare_files(args.config, args.files, args.json, args.report, args.calibration)
     from velod.cli_play import evaluate_files
 
     return evaluate_files(args.config, args.files, _play_options(args), args.json, args.plot, floor=args.floor)
@@ -89,7 +91,7 @@ def _eval(args: argparse.Namespace) -> int:
 def _play_options(args: argparse.Namespace) -> PlayOptions:
     from velod.cli_play import PlayOptions
 
-    return PlayOptions(offline=args.offline, speed=args.speed, packets=args.packets)
+    return PlayOptions(args.offline, args.speed, args.packets, args.calibration)
 
 
 def _sim(args: argparse.Namespace) -> int:
@@ -215,6 +217,11 @@ def _add_config_option(parser: argparse.ArgumentParser) -> None:
 
 def _add_play_options(parser: argparse.ArgumentParser) -> None:
     _add_config_option(parser)
+    parser.add_argument(
+        "--calibration",
+        metavar="FILE",
+        help="instead of rig.calibration and of the recording's own (velod, Kalibr, ROS)",
+    )
     parser.add_argument("--offline", action="store_true", help="in one process, as fast as it goes; the same numbers")
     parser.add_argument(
         "--speed",

@@ -54,9 +54,11 @@ def compare_sequences(config: str | None, *, quick: bool, json: str | None, repo
     return _finish(rows, seeds, json, page)
 
 
-def compare_files(config: str | None, files: Sequence[str], json: str | None, report: str) -> int:
+def compare_files(
+    config: str | None, files: Sequence[str], json: str | None, report: str, calibration: str | None = None
+) -> int:
     """Recordings that hold the truth. Raises RunFailed where one yields no valid velocity."""
-    settings = settings_of(config)
+    settings = settings_of(config, calibration)
     page = Report(report, f"velod eval {' '.join(files)} --report (velod {__version__})")
     rows = []
     progress = _Progress(len(files))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,9 +14,10 @@ if TYPE_CHECKING:
     from velod.geometry.calibration import Calibration
 
 
-def settings_of(path: str | None) -> Settings:
-    """The settings of a file, or the defaults. Raises ConfigError."""
-    return Settings() if path is None else config.load(path)
+def settings_of(path: str | None, calibration: str | None = None) -> Settings:
+    """The settings of a file, or the defaults; ``calibration`` replaces rig.calibration. Raises ConfigError."""
+    settings = Settings() if path is None else config.load(path)
+    return settings if calibration is None else replace(settings, rig=replace(settings.rig, calibration=calibration))
 
 
 def calibration_of(settings: Settings) -> Calibration | None:

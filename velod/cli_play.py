@@ -29,6 +29,7 @@ class PlayOptions:
     offline: bool = False
     speed: float = 1.0  # times real time; inf: as fast as it goes, nothing lost
     packets: str = "200hz"
+    calibration: str | None = None  # a file instead of rig.calibration and of the recording's own
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +56,7 @@ class Played:
 
 def replay(config: str | None, file: str, options: PlayOptions, csv: str | None) -> int:
     """Play a recording and say what came out. Raises RunFailed if that is no valid velocity."""
-    played = play(config, file, options)
+    played = play(settings_of(config, options.calibration), file, options)
     if csv is not None:
         write_csv(csv, played.velocities)
     print(summary(played, _metrics(played)))
@@ -74,13 +75,14 @@ def evaluate_files(
     floor: bool = False,
 ) -> int:
     """Judge recordings against the truth that they hold. Raises RunFailed if one yields no valid velocity."""
+    settings = settings_of(config, options.calibration)
     rows, failed = [], []
     for file in files:
-        played = play(config, file, options)
+        played = play(settings, file, options)
         metrics = _metrics(played)
         if metrics is None:
             raise ValueError(f"{file}: holds no truth to judge against; `velod replay` needs none")
-        floor_mps = _floor_mps(config, played) if floor else None
+        floor_mps = _floor_mps(settings, played) if floor else None
         # With --json - the table must not get into the JSON.
         print(summary(played, metrics, floor_mps), file=sys.stderr if json == "-" else sys.stdout)
         rows.append(result_row(played, metrics, floor_mps))
@@ -95,12 +97,11 @@ def evaluate_files(
     return 0
 
 
-def play(config: str | None, file: str, options: PlayOptions) -> Played:
+def play(settings: Settings, file: str, options: PlayOptions) -> Played:
     """Run a recording through the stages, in one process or in several.
 
-    Raises ConfigError, CalibrationError, RecordingError, SessionError, RunFailed, KeyboardInterrupt.
+    Raises CalibrationError, RecordingError, SessionError, RunFailed, KeyboardInterrupt.
     """
-    settings = settings_of(config)
     chunking = Chunking.parse(options.packets)
     recording = open_recording(file, calibration=calibration_of(settings))
     if options.offline:
@@ -135,7 +136,9 @@ def _play_online(settings: Settings, recording: Recording, options: PlayOptions)
             zenoh=replace(settings.zenoh, lossless=True),
         )
     speed = None if lossless else options.speed
-    driver = player_command(str(recording.path), settings.zenoh, settings.rig.name, speed, options.packets)
+    driver = player_command(
+        str(recording.path), settings.zenoh, settings.rig.name, speed, options.packets, settings.rig.calibration
+    )
     live = VelocityLine()
 
     def show(p: Published) -> None:
@@ -179,10 +182,10 @@ def _metrics(played: Played) -> Metrics | None:
     return evaluate(played.velocities, played.recording.truth, played.recording.t_start_ns)
 
 
-def _floor_mps(config: str | None, played: Played) -> float | None:
+def _floor_mps(settings: Settings, played: Played) -> float | None:
     from velod.cli_compare import floor_mps
 
-    return floor_mps(settings_of(config), played.recording)
+    return floor_mps(settings, played.recording)
 
 
 def _drift_percent(played: Played) -> float | None:
@@ -291,11 +294,11 @@ def demo(config: str | None, name: str, seconds: float, seed: int, csv: str | No
     """Simulated sensors through the service. Raises RunFailed where the result is not as it should be."""
     from velod.sim import simulated_recording
 
-    settings_of(config)  # what is wrong with it must not wait for the simulation
+    settings = settings_of(config, calibration="")  # the simulated rig brings its own
     print(f"simulating {seconds:g} s of {name}: takes minutes the first time, then it is kept", file=sys.stderr)
     with _Bar("simulating") as bar:
         path = simulated_recording(name, seconds, seed, bar.show)
-    played = play(config, str(path), PlayOptions())
+    played = play(settings, str(path), PlayOptions())
     metrics = _metrics(played)
     assert metrics is not None, "a simulated recording holds the truth"
     if csv is not None:
@@ -303,7 +306,7 @@ def demo(config: str | None, name: str, seconds: float, seed: int, csv: str | No
     print(summary(played, metrics), file=sys.stderr if json == "-" else sys.stdout)
     if json is not None:
         write_json(json, result_row(played, metrics))
-    if missing := shortcomings(played, metrics, settings_of(config).optimizer.output_hz):
+    if missing := shortcomings(played, metrics, settings.optimizer.output_hz):
         raise RunFailed("; ".join(missing))
     return 0
 

@@ -12,9 +12,12 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import h5py
 import pytest
 
+from tests import slanted_scene
 from velod.cli import main
+from velod.geometry.calibration import save_calibration
 
 pytestmark = pytest.mark.system
 VELOD = [sys.executable, "-P", "-m", "velod.cli"]
@@ -46,6 +49,32 @@ def test_eval_through_the_processes_knows_the_latency(slanted: Path, settings_fi
     result = json.loads(out.read_text())
     assert result["ave_mps"] < 0.5 and result["valid_fraction"] > 0.9 and result["real_time_factor"] > 0.0
     assert 0.0 < result["latency_p50_ms"] <= result["latency_p99_ms"]
+
+
+@pytest.fixture
+def uncalibrated(tmp_path: Path) -> tuple[Path, Path]:
+    """A recording without a calibration of its own, and the file that holds it."""
+    recording = slanted_scene.write(tmp_path / "uncalibrated.h5", 0.6)
+    with h5py.File(recording, "a") as file:
+        del file["calib"]
+    save_calibration(tmp_path / "rig.yaml", slanted_scene.RIG)
+    return recording, tmp_path / "rig.yaml"
+
+
+@pytest.mark.parametrize("where", ["option", "settings"])
+def test_a_recording_without_a_calibration_is_played_with_the_one_that_is_named(
+    where: str, uncalibrated: tuple[Path, Path], settings_file: Path, tmp_path: Path
+) -> None:
+    recording, rig = uncalibrated
+    out = tmp_path / "out.json"
+    argv = ["eval", str(recording), "-c", str(settings_file), "--speed", "max", "--json", str(out)]
+    if where == "option":
+        argv += ["--calibration", str(rig)]
+    else:
+        settings_file.write_text(f'{settings_file.read_text()}[rig]\ncalibration = "{rig}"\n')
+    assert main(argv) == 0
+    result = json.loads(out.read_text())
+    assert result["ave_mps"] < 0.5 and result["valid_fraction"] > 0.9
 
 
 def test_the_demo_ends_with_its_error_against_the_truth(

@@ -25,7 +25,7 @@ from velod.io import open_recording
 COMMANDS = ("demo", "run", "replay", "eval", "sim", "echo", "top", "config", "warmup")
 EVAL_KEYS = [
     *("ave_mps", "rve_percent", "p95_mps", "n", "first_valid_s", "valid_fraction", "ave_floor_mps", "nees_mean"),
-    *("real_time_factor", "latency_p50_ms", "latency_p99_ms"),
+    *("drift_percent", "real_time_factor", "latency_p50_ms", "latency_p99_ms"),
 ]
 CSV_HEADER = "t_ns,vx,vy,vz,cov_xx,cov_xy,cov_xz,cov_yy,cov_yz,cov_zz,state,valid,age_ms"
 
@@ -110,6 +110,20 @@ def test_a_recording_without_truth_cannot_be_judged(
     with h5py.File(path, "a") as f:
         del f["gt"]
     assert "holds no truth" in error_of(capsys, "eval", str(path), "--offline")
+
+
+def test_a_recording_without_a_calibration_asks_for_one_and_takes_the_one_that_is_named(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, recording: Path
+) -> None:
+    path, rig = tmp_path / "bare.h5", tmp_path / "rig.yaml"
+    path.write_bytes(recording.read_bytes())
+    with h5py.File(path, "a") as f:
+        del f["calib"]
+    save_calibration(rig, slanted_scene.RIG)
+    error = error_of(capsys, "replay", str(path), "--offline")
+    assert error == f"{path}: no calibration (/calib is missing); name a file: --calibration FILE"
+    assert error_of(capsys, "replay", str(path), "--calibration", "nowhere.yaml").startswith("nowhere.yaml: ")
+    assert main(["replay", str(path), "--offline", "--calibration", str(rig)]) == 0
 
 
 def test_a_calibration_that_cannot_be_read_is_named(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

@@ -47,7 +47,8 @@ def _find_calibration(path: Path) -> Path:
         if candidate.is_file():
             return candidate
     raise CalibrationError(
-        f"{path}: no calibration: neither cam_to_cam.yaml nor calibration/cam_to_cam.yaml is there"
+        f"{path}: no calibration: neither cam_to_cam.yaml nor calibration/cam_to_cam.yaml is there; "
+        "name a file: --calibration FILE"
     )
 
 

@@ -49,7 +49,7 @@ def read_depth(path: str | Path) -> DepthTruth | None:
 def read_calibration(file: Any, path: Path) -> Calibration:
     """``/calib``: one pinhole model for both cameras, which look the same way, ``baseline_m`` apart along x."""
     if "calib" not in file:
-        raise CalibrationError(f"{path}: no calibration (/calib is missing)")
+        raise CalibrationError(f"{path}: no calibration (/calib is missing); name a file: --calibration FILE")
     attrs = file["calib"].attrs
     number = {name: _number(attrs, name, path) for name in ("width", "height", "fx", "fy", "cx", "cy", "baseline_m")}
     model, dist = _distortion(attrs, path)

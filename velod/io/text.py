@@ -40,8 +40,8 @@ def read(path: Path, right: Path | None, calibration: Calibration | None) -> Par
     calib_path = _find("calibration.yaml", places)
     if calibration is None and calib_path is None:
         raise CalibrationError(
-            f"{path}: no stereo calibration: calib.txt has no baseline; give a calibration file or put it there as "
-            "calibration.yaml"
+            f"{path}: no stereo calibration: calib.txt has no baseline; name a file (--calibration FILE) or put it "
+            "there as calibration.yaml"
         )
     calib = calibration if calibration is not None else load_calibration(calib_path or path)
     imu_path, truth_path = _find("imu.txt", places), _find("groundtruth.txt", places)

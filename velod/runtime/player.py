@@ -20,6 +20,7 @@ from typing import Self
 import zenoh
 
 from velod.config import ZenohSettings
+from velod.geometry.calibration import load_calibration
 from velod.io import open_recording
 from velod.io.packets import Chunking
 from velod.runtime.health import HealthReporter
@@ -200,11 +201,21 @@ def _publish(outlet: Outlet, packet: EventPacket | ImuPacket) -> str:
 
 
 def player_command(
-    recording: str, settings: ZenohSettings, rig: str, speed: float | None = 1.0, packets: str = "200hz"
+    recording: str,
+    settings: ZenohSettings,
+    rig: str,
+    speed: float | None = 1.0,
+    packets: str = "200hz",
+    calibration: str = "",
 ) -> list[str]:
-    """The command line that plays a recording to the service with these settings."""
+    """The command line that plays a recording to the service with these settings.
+
+    ``calibration``: the file that stands in for the recording's own; empty: none does.
+    """
     said = "max" if speed is None else f"{speed:g}"
     command = [sys.executable, "-P", "-m", "velod.runtime.player", recording, "--speed", said, "--packets", packets]
+    if calibration:
+        command += ["--calibration", calibration]
     return [*command, *worker_arguments(replace(settings, lossless=speed is None), rig, "player-0")]
 
 
@@ -233,12 +244,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--packets", type=_chunking, default=Chunking(), help="200hz, 1000hz, 60hz, random, random:SEED"
     )
+    parser.add_argument("--calibration", metavar="FILE", help="in place of the recording's own, which it may lack")
     args = parser.parse_args(argv)
     start_logging(args.worker)
     try:
         prepare_process(args.parent)
         stop = stop_on_signals()
-        packets = open_recording(args.recording).packets(args.packets)
+        calibration = load_calibration(args.calibration) if args.calibration else None
+        packets = open_recording(args.recording, calibration=calibration).packets(args.packets)
         ahead = Prefetch(packets)
         if args.speed is not None:
             ahead.fill(PREFETCH_S)
