@@ -7,6 +7,7 @@ import pytest
 
 from velod.geometry.calibration import Camera
 from velod.io import EventColumns
+from velod.sim.effects import Effects
 from velod.sim.events import LOG_EPS, EventModel, EventSensor, _time_order
 from velod.sim.render import Renderer, _atan2
 from velod.sim.scene import Scene, corridor, room
@@ -20,7 +21,7 @@ WHOLE = np.array([[0, HEIGHT, 0, WIDTH]])
 
 def watch(model: EventModel, log_intensity: list[F64], t_us: list[int]) -> EventColumns:
     """Events of an image whose rows all show ``log_intensity`` (one row of WIDTH per moment)."""
-    sensor = EventSensor(model, WIDTH, HEIGHT, np.random.default_rng(0))
+    sensor = EventSensor(model, Effects(), WIDTH, HEIGHT, np.random.default_rng(0))
     views: list[F32] = [np.tile(np.exp(row) - LOG_EPS, (HEIGHT, 1)).astype(np.float32) for row in log_intensity]
     sensor.start(views[0])
     for view, before, now in zip(views[1:], t_us[:-1], t_us[1:], strict=True):

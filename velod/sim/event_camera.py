@@ -7,6 +7,7 @@ from numba import njit
 
 from velod.geometry.calibration import Camera
 from velod.io.model import EventColumns
+from velod.sim.effects import Effects
 from velod.sim.events import EventModel, EventSensor
 from velod.sim.render import Renderer
 from velod.sim.scene import Scene
@@ -16,8 +17,11 @@ from velod.types import F32, F64, I64
 MAX_MOTION_PX = 1.0
 """The largest image motion between two views of a pixel; in between, its log intensity runs linearly (ESIM)."""
 
-BLOCK_STEPS = 12
-"""A tile where all moves slowly is rendered every second, third, fourth, sixth or twelfth step only."""
+STEPS = 3
+"""Steps per MAX_MOTION_PX of the fastest tile, so that slower ones too come close to it between their views."""
+
+BLOCK_STEPS = 12 * STEPS
+"""Steps until all tiles are rendered and the depth that decides about the motion is known anew."""
 
 TILE_PX = 16
 _HALO_PX = 12  # what may move into a tile within BLOCK_STEPS steps
@@ -33,15 +37,17 @@ class EventCamera:
         texture: Texture,
         camera: Camera,
         model: EventModel,
+        effects: Effects,
         offset_B: F64,
         rng: np.random.Generator,
     ) -> None:
         self._renderer = Renderer(scene, texture, camera)
-        self._sensor = EventSensor(model, camera.width, camera.height, rng)
+        self._sensor = EventSensor(model, effects, camera.width, camera.height, rng)
         self._camera = camera
         self._offset_B = offset_B
         self._tiles = _tiles(camera.width, camera.height)
         self._seen_us = np.zeros(len(self._tiles), np.int64)
+        self._joined = np.empty_like(self._tiles)
 
     @property
     def depth(self) -> F32:
@@ -60,16 +66,20 @@ class EventCamera:
         _tile_speeds(self.depth, pinhole, v_B + np.cross(omega_B, self._offset_B), omega_B, self._tiles, speeds)
         return speeds
 
-    def run(self, from_us: int, steps_us: list[int], poses: list[tuple[F64, F64]], every: I64) -> EventColumns:
-        """Events of ``from_us < t <= steps_us[-1]``, with a pose (R_WB, p_WB) per step.
+    def run(self, from_us: int, steps_us: list[int], R_WB: F64, p_WB: F64, motion_px: F64) -> EventColumns:
+        """Events of ``from_us < t <= steps_us[-1]``, with a pose R_WB (n, 3, 3), p_WB (n, 3) per step.
 
-        Tile k is rendered every ``every[k]``-th step, and all tiles at the last step.
+        ``motion_px`` (tiles,): within a step. A tile is rendered when MAX_MOTION_PX is up, and at the last step.
         """
-        for k, (to_us, (R_WB, p_WB)) in enumerate(zip(steps_us, poses, strict=True), start=1):
-            due = np.full(len(every), True) if k == len(steps_us) else k % every == 0
-            areas = self._tiles[due]
-            self._renderer.render(R_WB, p_WB + R_WB @ self._offset_B, areas)
-            self._sensor.see(self._renderer.intensity, areas, self._seen_us[due], to_us)
+        p_WC = p_WB + R_WB @ self._offset_B
+        every = np.maximum(MAX_MOTION_PX / np.maximum(motion_px, 1e-9), 1.0).astype(np.int64)
+        for k, to_us in enumerate(steps_us):
+            due = np.flatnonzero((k + 1) % every == 0) if k + 1 < len(steps_us) else np.arange(len(every))
+            if len(due) == 0:
+                continue
+            joined = self._joined[: _join(self._tiles, due, self._joined)]
+            self._renderer.render(R_WB[k], p_WC[k], joined)
+            self._sensor.see(self._renderer.intensity, self._tiles[due], self._seen_us[due], to_us)
             self._seen_us[due] = to_us
         return self._sensor.take(from_us, steps_us[-1])
 
@@ -84,6 +94,20 @@ def _tiles(width: int, height: int) -> I64:
         ],
         dtype=np.int64,
     )
+
+
+@njit(cache=True, nogil=True)
+def _join(tiles: I64, due: I64, areas: I64) -> int:
+    """Fill ``areas`` with runs of neighbours in a row of tiles: long rows render faster. Returns their number."""
+    n = 0
+    for k in range(due.shape[0]):
+        j0, j1, i0, i1 = tiles[due[k]]
+        if n > 0 and areas[n - 1, 0] == j0 and areas[n - 1, 3] == i0:
+            areas[n - 1, 3] = i1
+        else:
+            areas[n, 0], areas[n, 1], areas[n, 2], areas[n, 3] = j0, j1, i0, i1
+            n += 1
+    return n
 
 
 @njit(cache=True, nogil=True)

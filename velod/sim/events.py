@@ -11,6 +11,7 @@ import numpy as np
 from numba import njit
 
 from velod.io.model import EventColumns
+from velod.sim.effects import Effects, Noise, merged
 from velod.types import F32, I64, U8, U16
 
 LOG_EPS = 1e-3
@@ -31,7 +32,9 @@ class EventModel:
 class EventSensor:
     """The pixels of one camera. Views come area by area, each with its own time; events go out in time order."""
 
-    def __init__(self, model: EventModel, width: int, height: int, rng: np.random.Generator) -> None:
+    def __init__(
+        self, model: EventModel, effects: Effects, width: int, height: int, rng: np.random.Generator
+    ) -> None:
         spread = rng.normal(model.threshold, model.threshold_sigma, (2, height, width))
         # A threshold far below the others would fire on nothing at all.
         self._threshold = np.maximum(spread, 0.1 * model.threshold).astype(np.float32)
@@ -40,6 +43,9 @@ class EventSensor:
         self._reference = np.zeros((height, width), np.float32)
         self._last_us = np.full((height, width), -(1 << 40), np.int64)
         self._per_pixel = int(_LOG_RANGE / float(self._threshold.min())) + 1
+        self._row = np.empty(width, np.float32)
+        self._leak_hz, self._bandwidth_hz = effects.leak_hz, effects.bandwidth_hz
+        self._noise = Noise(effects, width, height, rng)
         self._count = 0
         self._t_us: I64 = np.empty(0, np.int64)
         self._x: U16 = np.empty(0, np.uint16)
@@ -53,18 +59,20 @@ class EventSensor:
 
     def see(self, intensity: F32, areas: I64, from_us: I64, to_us: int) -> None:
         """``areas`` (m, 4) of ``intensity`` are as seen at ``to_us``; they were last seen at ``from_us`` (m,)."""
-        pixels = int(((areas[:, 1] - areas[:, 0]) * (areas[:, 3] - areas[:, 2])).sum())
-        self._make_room(pixels * self._per_pixel)
+        self._make_room(intensity.size * self._per_pixel)
         self._count = _emit(
             intensity,
             areas,
             from_us,
             to_us,
+            self._row,
             self._log,
             self._reference,
             self._threshold,
             self._last_us,
             self._refractory_us,
+            self._leak_hz,
+            self._bandwidth_hz,
             self._t_us,
             self._x,
             self._y,
@@ -77,7 +85,8 @@ class EventSensor:
         n = self._count
         self._count = 0
         order = _time_order(self._t_us[:n], from_us, to_us)
-        return EventColumns(self._t_us[order] * 1000, self._x[order], self._y[order], self._p[order])
+        seen = EventColumns(self._t_us[order] * 1000, self._x[order], self._y[order], self._p[order])
+        return merged(seen, self._noise.between(from_us, to_us))
 
     def _make_room(self, n: int) -> None:
         if len(self._t_us) - self._count >= n:
@@ -95,26 +104,36 @@ def _emit(
     areas: I64,
     from_us: I64,
     to_us: int,
+    row: F32,
     log: F32,
     reference: F32,
     threshold: F32,
     last_us: I64,
     refractory_us: int,
+    leak_hz: float,
+    bandwidth_hz: float,
     t_us: I64,
     x: U16,
     y: U16,
     p: U8,
     count: int,
 ) -> int:
-    """Cross the thresholds of every pixel in ``areas``; returns the new count."""
-    eps = np.float32(LOG_EPS)
+    """Cross the thresholds of every pixel in ``areas``; returns the new count. ``row`` is room to work in."""
     for m in range(areas.shape[0]):
-        start_us = from_us[m]
+        start_us, i0, i1 = from_us[m], areas[m, 2], areas[m, 3]
         span_us = np.float64(to_us - start_us)
         for j in range(areas[m, 0], areas[m, 1]):
-            for i in range(areas[m, 2], areas[m, 3]):
-                before, after = log[j, i], np.log(eps + intensity[j, i])
-                log[j, i] = after
+            now = row[: i1 - i0]
+            _log_row(intensity[j, i0:i1], now)
+            if bandwidth_hz > 0.0:
+                _follow(now, log[j, i0:i1], intensity[j, i0:i1], bandwidth_hz * span_us * 1e-6)
+            for i in range(i0, i1):
+                # The reference sinks; to the comparison that is the same as an intensity that rises.
+                leak = np.float32(leak_hz * span_us * 1e-6) * threshold[1, j, i] if leak_hz > 0.0 else np.float32(0.0)
+                before, after = log[j, i], now[i - i0] + leak
+                if after == before:
+                    continue
+                log[j, i] = now[i - i0]
                 level = reference[j, i]
                 polarity = 1 if after > level else 0
                 step = threshold[polarity, j, i] if polarity == 1 else -threshold[polarity, j, i]
@@ -126,8 +145,34 @@ def _emit(
                         last_us[j, i] = t
                         t_us[count], x[count], y[count], p[count] = t, i, j, polarity
                         count += 1
-                reference[j, i] = level
+                reference[j, i] = level - leak
     return count
+
+
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def _log_row(intensity: F32, out: F32) -> None:
+    """log(eps + intensity) to 2e-6, several times as fast as the library's: LLVM vectorises it."""
+    one, third, fifth, seventh = np.float32(1.0), np.float32(1.0 / 3.0), np.float32(0.2), np.float32(1.0 / 7.0)
+    two, ln_2, root_2 = np.float32(2.0), np.float32(np.log(2.0)), 0x3FB504F3
+    for i in range(intensity.shape[0]):
+        bits = np.float32(np.float32(LOG_EPS) + intensity[i]).view(np.int32)
+        # x = 2^e m with m between sqrt(1/2) and sqrt(2); log m = 2 artanh((m - 1) / (m + 1))
+        e = (bits - root_2 + 0x00800000) >> 23
+        m = np.int32(bits - (e << 23)).view(np.float32)
+        s = (m - one) / (m + one)
+        q = s * s
+        out[i] = np.float32(e) * ln_2 + two * s * (one + q * (third + q * (fifth + q * seventh)))
+
+
+@njit(cache=True, nogil=True)
+def _follow(now: F32, before: F32, intensity: F32, corner_turns: float) -> None:
+    """Low-pass ``now``, the log intensity after an interval of ``corner_turns`` = bandwidth * time.
+
+    The corner is in proportion to the photocurrent, with a dark current of 1/12 (Hu, Liu, Delbruck, "v2e", 2021).
+    """
+    for i in range(now.shape[0]):
+        light = (intensity[i] + 1.0 / 12.0) / (1.0 + 1.0 / 12.0)
+        now[i] = before[i] + (now[i] - before[i]) * (1.0 - np.exp(-2.0 * np.pi * corner_turns * light))
 
 
 @njit(cache=True, nogil=True)

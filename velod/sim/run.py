@@ -12,19 +12,19 @@ import numpy as np
 from velod.geometry.so3 import quaternion_from_matrix
 from velod.io.model import NO_EVENTS, DepthTruth, EventColumns, Truth
 from velod.io.sequence import RecordingWriter
-from velod.sim.event_camera import BLOCK_STEPS, MAX_MOTION_PX, EventCamera
+from velod.sim.effects import Readout
+from velod.sim.event_camera import BLOCK_STEPS, MAX_MOTION_PX, STEPS, EventCamera
 from velod.sim.imu import sample_imu
 from velod.sim.sequences import BASELINE_M, Sequence
 from velod.sim.texture import make_texture
 from velod.sim.trajectory import Trajectory
-from velod.types import F32, F64, I64
+from velod.types import F32, F64
 
 Progress = Callable[[float], None]
 """Called with the share that is done, 0..1."""
 
-_STEP_US = (20, 2000)
+_STEP_US = (7, 700)
 _DEPTH_PERIOD_US = 100_000
-_DIVISORS = np.array([k for k in range(1, BLOCK_STEPS + 1) if BLOCK_STEPS % k == 0])
 
 
 def simulate(
@@ -38,17 +38,24 @@ def simulate(
 
     The two cameras are rendered in two threads. Raises RecordingError where the file cannot be written.
     """
-    imu_rng, left_rng, right_rng = (np.random.default_rng((seed, k)) for k in range(3))
+    imu_rng, left_rng, right_rng, *clock_rngs = (np.random.default_rng((seed, k)) for k in range(5))
     end_us = round(seconds * 1e6)
     depths: list[F32] = []
+    effects = sequence.effects
+    left, right = (
+        Readout(effects, offset_us, rng)
+        for offset_us, rng in zip((0, effects.clock_offset_us), clock_rngs, strict=True)
+    )
     with RecordingWriter(path, sequence.calibration) as writer:
         for block in _render(sequence, end_us, left_rng, right_rng):
-            writer.append("left", block.left)
-            writer.append("right", block.right)
+            writer.append("left", left.read(block.left, block.t_us))
+            writer.append("right", right.read(block.right, block.t_us))
             if block.depth is not None:
                 depths.append(block.depth)
             if progress is not None:
                 progress(block.t_us / end_us)
+        writer.append("left", left.read(NO_EVENTS, None))
+        writer.append("right", right.read(NO_EVENTS, None))
         writer.finish(
             sample_imu(sequence.trajectory, sequence.imu, seconds, imu_rng),
             true_motion(sequence.trajectory, seconds),
@@ -81,8 +88,11 @@ def _render(
     A step is so short that nothing in either image moves more than MAX_MOTION_PX.
     """
     scene, camera, texture = sequence.scene, sequence.calibration.left, make_texture(sequence.texture)
-    left = EventCamera(scene, texture, camera, sequence.events, np.zeros(3), left_rng)
-    right = EventCamera(scene, texture, camera, sequence.events, np.array([BASELINE_M, 0.0, 0.0]), right_rng)
+    effects = sequence.effects
+    left, right = (
+        EventCamera(scene, texture, camera, sequence.events, effects, np.array([x_m, 0.0, 0.0]), rng)
+        for x_m, rng in ((0.0, left_rng), (BASELINE_M, right_rng))
+    )
     at_us = 0
     R_WB, p_WB, v_B, omega_B = _pose(sequence.trajectory, at_us)
     for eye in (left, right):
@@ -92,14 +102,14 @@ def _render(
         while at_us < end_us:
             speeds = [eye.tile_speeds(v_B, omega_B) for eye in (left, right)]
             fastest = max(float(speed.max()) for speed in speeds)
-            step_us = int(np.clip(MAX_MOTION_PX * 1e6 / max(fastest, 1e-3), *_STEP_US))
+            step_us = int(np.clip(MAX_MOTION_PX * 1e6 / STEPS / max(fastest, 1e-3), *_STEP_US))
             # Depth images are due at whole periods, at the end of a block.
             until_us = min(at_us - at_us % _DEPTH_PERIOD_US + _DEPTH_PERIOD_US, end_us)
             steps_us = list(range(at_us + step_us, until_us, step_us))[: BLOCK_STEPS - 1]
             steps_us.append(min(at_us + (len(steps_us) + 1) * step_us, until_us))
-            poses = [_pose(sequence.trajectory, t_us)[:2] for t_us in steps_us]
+            motion = sequence.trajectory.at(np.array(steps_us) / 1e6)
             jobs = [
-                pool.submit(eye.run, at_us, steps_us, poses, _every(speed, step_us))
+                pool.submit(eye.run, at_us, steps_us, motion.R_WB, motion.p_WB, speed * step_us * 1e-6)
                 for eye, speed in zip((left, right), speeds, strict=True)
             ]
             seen_left, seen_right = (job.result() for job in jobs)
@@ -112,9 +122,3 @@ def _pose(trajectory: Trajectory, t_us: int) -> tuple[F64, F64, F64, F64]:
     """R_WB, p_WB, v_B, omega_B."""
     motion = trajectory.at(np.array([t_us / 1e6]))
     return motion.R_WB[0], motion.p_WB[0], motion.v_B[0], motion.omega_B[0]
-
-
-def _every(speed_px_s: F64, step_us: int) -> I64:
-    """Each tile's largest divisor of BLOCK_STEPS in which its image moves by at most MAX_MOTION_PX."""
-    steps = MAX_MOTION_PX * 1e6 / (np.maximum(speed_px_s, 1e-3) * step_us)
-    return _DIVISORS[np.maximum(np.searchsorted(_DIVISORS, steps, side="right") - 1, 0)]

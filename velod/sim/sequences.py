@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from velod.geometry.calibration import Calibration, Camera
+from velod.sim.effects import Effects
 from velod.sim.events import EventModel
 from velod.sim.imu import ImuModel
 from velod.sim.scene import Scene, corridor, room, scatter_boxes
@@ -35,12 +36,14 @@ class Sequence:
     scene: Scene
     texture: TextureRecipe = field(default_factory=TextureRecipe)
     events: EventModel = field(default_factory=EventModel)
+    effects: Effects = field(default_factory=Effects)
     imu: ImuModel = field(default_factory=ImuModel)
 
     @property
     def calibration(self) -> Calibration:
-        """A rectified, undistorted pair of DAVIS346; left camera = body = IMU."""
-        camera = Camera(346, 260, 231.5, 231.5, 172.5, 129.5)
+        """A pair of DAVIS346 that look the same way; left camera = body = IMU. Undistorted but for the effects."""
+        radtan = self.effects.radtan
+        camera = Camera(346, 260, 231.5, 231.5, 172.5, 129.5, "radtan" if radtan else "none", radtan)
         return Calibration(camera, camera, np.eye(3), np.array([-BASELINE_M, 0.0, 0.0]))
 
 

@@ -6,7 +6,9 @@ sharp edges in all directions at all scales, as in pictures of real places.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numba import njit
@@ -28,6 +30,7 @@ class Texture:
     """Levels of halved resolution in one array: level k has (SIZE >> k)^2 texels from ``offset[k]`` on."""
 
     texels: F32  # linear intensity, 0..1
+    flat: F32  # likewise: the intensity where it is one in all 5 x 5 texels around, otherwise -1; level 0 is unused
     offset: I64  # (levels,)
 
 
@@ -42,8 +45,9 @@ class TextureRecipe:
     seed: int = 1
 
 
+@lru_cache(maxsize=1)
 def make_texture(recipe: TextureRecipe) -> Texture:
-    """Paint the leaves and build the pyramid."""
+    """Paint the leaves and build the pyramid. The last one is kept: its arrays are for reading only."""
     rng = np.random.default_rng(recipe.seed)
     n = recipe.leaves
     # Radii of density r^-3, as scale invariance asks.
@@ -91,15 +95,31 @@ def _binomial(image: F32) -> F32:
 
 
 def _pyramid(level: F32) -> Texture:
-    levels = [level]
+    levels, darkest, brightest = [level], level, level
+    flat = [np.full_like(level, -1.0)]  # the finest is never asked for
     for _ in range(COARSEST):
-        level = level.reshape(len(level) // 2, 2, len(level) // 2, 2).mean(axis=(1, 3), dtype=np.float32)
+        level, darkest, brightest = _halved(level, np.mean), _halved(darkest, np.min), _halved(brightest, np.max)
         levels.append(level)
+        flat.append(_flat(darkest, brightest))
     offset = np.cumsum([0] + [part.size for part in levels[:-1]], dtype=np.int64)
-    return Texture(np.concatenate([part.ravel() for part in levels]), offset)
+    texels, flats = (np.concatenate([part.ravel() for part in parts]) for parts in (levels, flat))
+    return Texture(texels, flats, offset)
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+def _halved(level: F32, value_of: Callable[..., F32]) -> F32:
+    half = len(level) // 2
+    return value_of(level.reshape(half, 2, half, 2), axis=(1, 3)).astype(np.float32)
+
+
+def _flat(darkest: F32, brightest: F32) -> F32:
+    """The one intensity of all that the 5 x 5 texels around cover, -1 where there are several."""
+    for axis in (0, 1):
+        darkest = np.minimum.reduce([np.roll(darkest, n, axis) for n in range(-2, 3)])
+        brightest = np.maximum.reduce([np.roll(brightest, n, axis) for n in range(-2, 3)])
+    return np.where(darkest == brightest, brightest, np.float32(-1.0))
+
+
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def sample(
     texels: F32,
     start: np.uint32,
@@ -121,7 +141,7 @@ def sample(
     return blend
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _bilinear(texels: F32, start: np.uint32, size: np.uint32, x: np.float32, y: np.float32) -> np.float32:
     """Between the four texels of a level around (x, y); the centre of texel i lies at i."""
     x0, y0 = np.floor(x), np.floor(y)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from velod.geometry.camera import normalised, undistort
 from velod.io.model import DepthTruth, Truth
-from velod.sim.render import _cast_boxes, _cast_corridor, _cast_room
+from velod.sim.render import Caster
 from velod.sim.sequences import TABLE_I, Sequence, sequence
 from velod.types import F64, I64
 
@@ -20,18 +21,15 @@ def true_depth(recipe: Sequence, t_ns: I64, x: F64, y: F64) -> F64:
     """
     scene, camera = recipe.scene, recipe.calibration.left
     motion = recipe.trajectory.at(t_ns.astype(np.float64) * 1e-9)
-    depth, surface = np.zeros((1, 1), np.float32), np.zeros((1, 1), np.int64)
     found = np.empty(len(t_ns))
+    rays = np.empty((2, 1, 1), np.float32)
+    caster = Caster(scene, rays, camera.fx)
+    looks = undistort(normalised(np.stack([x, y], axis=1), camera), camera)
     for k in range(len(t_ns)):
-        # An image of one pixel, whose centre is at (x, y) of the camera's.
-        pinhole = np.array([camera.fx, camera.fy, camera.cx - x[k], camera.cy - y[k]])
-        pose = (pinhole, np.ascontiguousarray(motion.R_WB[k]), np.ascontiguousarray(motion.p_WB[k]))
-        if len(scene.shell) == 3:
-            _cast_corridor(scene.shell, *pose, _ONE_PIXEL, depth, surface)
-        else:
-            _cast_room(scene.shell, *pose, _ONE_PIXEL, depth, surface)
-            _cast_boxes(scene.boxes, *pose, _ONE_PIXEL, depth, surface)
-        found[k] = depth[0, 0]
+        # An image of one pixel, which looks where (x, y) of the camera's does.
+        rays[:, 0, 0] = looks[k]
+        caster.cast(np.ascontiguousarray(motion.R_WB[k]), np.ascontiguousarray(motion.p_WB[k]), _ONE_PIXEL)
+        found[k] = caster.depth[0, 0]
     return found
 
 
