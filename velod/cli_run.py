@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import tempfile
 import time
 from dataclasses import replace
+from pathlib import Path
 
 from velod.cli_config import calibration_of, settings_of
 from velod.config import ConfigError, Settings
@@ -29,10 +31,13 @@ def run(config: str | None, only: list[str] | None, connect: str | None, worker:
 
 
 def warmup() -> int:
-    """Compile and cache the kernels of all stages."""
+    """Compile and cache the kernels of all stages and of the simulator."""
     from velod.runtime.warmup import fill_cache
+    from velod.sim import sequence, simulate
 
     start_s = time.monotonic()
     fill_cache(Settings())
+    with tempfile.TemporaryDirectory() as directory:
+        simulate(sequence("corridor-1"), 0.01, 1, Path(directory) / "warmup.h5")
     print(f"kernels ready after {time.monotonic() - start_s:.1f} s")
     return 0

@@ -154,5 +154,6 @@ def played(rate_hz: float) -> Played:
 
 def test_a_demo_that_falls_short_says_in_what() -> None:
     assert shortcomings(played(75.0), metrics(0.05, 1.0), 75.0) == []
+    assert shortcomings(played(75.0), metrics(0.11, 1.0), 75.0) == ["AVE 0.110 m/s, at most 0.1 belongs there"]
     text = "; ".join(shortcomings(played(50.0), metrics(float("nan"), 0.5), 75.0))
     assert "AVE nan m/s" in text and "only 50 %" in text and "50.0 velocities per second instead of 75" in text
