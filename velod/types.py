@@ -65,7 +65,9 @@ class ImuPacket:
 class EventBatch:
     """Selected left events with their neighbourhoods on the surface of active events: ingest -> flow.
 
-    The batch holds the left events with ``t_start_ns <= t < t_ns``; ``t_ns`` is its (exclusive) end.
+    The batch spans the left events with ``t_start_ns <= t < t_ns``; ``t_ns`` is its (exclusive) end. A selected event
+    may be older than ``t_start_ns``, by up to half the memory: it is selected in the batch that completes its
+    neighbourhood.
     """
 
     seq: int
@@ -174,6 +176,19 @@ class Velocity:
 
 
 @dataclass(frozen=True, slots=True)
+class Odometry:
+    """Dead reckoning: the velocity integrated once. Frame O: where it began, z up, heading of B zero at that moment."""
+
+    seq: int
+    t_ns: int  # sensor time
+    origin_t_ns: int  # when it began; it begins anew after the velocity was lost
+    p_OB: F64  # (3,) position of B's origin, m, frame O
+    q_OB: F64  # (4,) attitude, xyzw
+    cov: F64  # (3, 3) covariance of p_OB, m^2
+    distance_m: float  # way since the origin
+
+
+@dataclass(frozen=True, slots=True)
 class Health:
     """State of one process, published at 1 Hz."""
 
@@ -210,6 +225,7 @@ Message = (
     | DepthBatch
     | ImuSamples
     | Velocity
+    | Odometry
     | Health
     | Done
 )
