@@ -177,7 +177,7 @@ class Velocity:
 
 @dataclass(frozen=True, slots=True)
 class Odometry:
-    """Dead reckoning: the velocity integrated once. Frame O: where it began, z up, heading of B zero at that moment."""
+    """Dead reckoning: the velocity integrated once. Frame O: where it began, z up, heading of B zero then."""
 
     seq: int
     t_ns: int  # sensor time

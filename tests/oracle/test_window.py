@@ -10,7 +10,7 @@ from velod.optimizer.estimator import Estimator, Head
 from velod.optimizer.preintegration import preintegrate
 from velod.optimizer.stage import OptimizerStage
 from velod.optimizer.window import HEAD, Window
-from velod.types import ImuSamples
+from velod.types import ImuSamples, Velocity
 
 KNOT_NS = 100_000_000
 
@@ -263,7 +263,7 @@ def test_an_estimate_does_not_notice_that_the_integrated_velocity_is_counted_ane
     def final(limit):
         monkeypatch.setattr("velod.optimizer.estimator.MAX_INTEGRATED", limit)
         stage = OptimizerStage(from_tree({}), CALIBRATION)
-        velocities = [v for m in messages(FLIGHT, 1.0) for v in stage.handle(m)]
+        velocities = [v for m in messages(FLIGHT, 1.0) for v in stage.handle(m) if isinstance(v, Velocity)]
         return np.array([v.v_B for v in velocities]), stage._estimator.memory.at(np.array([velocities[-1].t_ns - 1]))[
             1
         ]

@@ -11,7 +11,8 @@ from velod.types import DepthBatch, FlowBatch, ImuSamples, Velocity
 
 def run(stream, **optimizer):
     stage = OptimizerStage(from_tree({"optimizer": optimizer}), CALIBRATION)
-    return [v for message in stream for v in stage.handle(message)], stage
+    out = [v for message in stream for v in stage.handle(message) if isinstance(v, Velocity)]
+    return out, stage
 
 
 def same(a, b):

@@ -92,7 +92,8 @@ class SecondFlow:
 def estimate(front_end: FrontEnd, settings: Settings, calibration: Calibration) -> list[Velocity]:
     """What the optimizer makes of it."""
     optimizer = OptimizerStage(settings, calibration)
-    return [velocity for message in front_end.messages for velocity in optimizer.handle(message)]
+    out = (o for message in front_end.messages for o in optimizer.handle(message))
+    return [o for o in out if isinstance(o, Velocity)]
 
 
 def joined(flow: FlowBatch, depth: DepthBatch) -> tuple[FlowBatch, DepthBatch]:

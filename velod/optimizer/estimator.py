@@ -116,6 +116,14 @@ class Estimator:
         v, cov = self._carried[t_ns]
         return v.copy(), cov.copy()
 
+    def attitude(self, t_ns: int) -> tuple[F64, F64] | None:
+        """R_LB (3, 3) and gravity in B (3,), upwards, at ``t_ns``, carried there from the head by the gyroscope."""
+        head = self.head
+        if head is None or not self.memory.covers(head.t_ns, t_ns):
+            return None
+        R_LB = head.R_LB @ self._preintegrate(head.t_ns, t_ns, head.b_a, head.b_w).R_gamma
+        return R_LB, R_LB.T @ head.g_L
+
     def _biases(self) -> tuple[F64, F64]:
         return (np.zeros(3), np.zeros(3)) if self.head is None else (self.head.b_a, self.head.b_w)
 

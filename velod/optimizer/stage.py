@@ -13,8 +13,9 @@ import numpy as np
 
 from velod.config import Settings
 from velod.geometry.calibration import Calibration
+from velod.optimizer.dead_reckoning import DeadReckoning
 from velod.optimizer.estimator import Estimator
-from velod.types import NS_PER_S, DepthBatch, FlowBatch, ImuSamples, TrackingState, Velocity
+from velod.types import NS_PER_S, DepthBatch, FlowBatch, ImuSamples, Odometry, TrackingState, Velocity
 
 UNKNOWN_SIGMA = 100.0
 """Of a velocity nothing is known about, m/s."""
@@ -41,7 +42,7 @@ class _Pending:
 
 
 class OptimizerStage:
-    """``handle(FlowBatch | DepthBatch | ImuSamples) -> [Velocity]``."""
+    """``handle(FlowBatch | DepthBatch | ImuSamples) -> [Velocity | Odometry]``."""
 
     def __init__(self, settings: Settings, calibration: Calibration) -> None:
         self._settings, self._calibration = settings, calibration
@@ -51,6 +52,7 @@ class OptimizerStage:
         self.counters: dict[str, int] = {}
         self.alarms: dict[str, str] = {}
         self._seq = 0
+        self._reckoning = DeadReckoning(settings.optimizer.window_s, settings.imu.gyro_noise)
         self._pending: dict[int, _Pending] = {}  # by seq
         self._ends: dict[int, int] = {}  # seq -> end of closed batches that have not been taken in
         self._taken: set[int] = set()  # taken in before an earlier one that is still missing
@@ -68,8 +70,11 @@ class OptimizerStage:
         self._was_valid = False
         self._newest = (-1, 0)  # seq and t_ns of the newest batch taken in
 
-    def handle(self, message: FlowBatch | DepthBatch | ImuSamples) -> list[Velocity]:
-        """Take one message; return the velocities that it completes. Raises TypeError for other messages."""
+    def handle(self, message: FlowBatch | DepthBatch | ImuSamples) -> list[Velocity | Odometry]:
+        """Take one message; return the velocities that it completes, a valid one with its dead reckoning.
+
+        Raises TypeError for other messages.
+        """
         if isinstance(message, ImuSamples):
             self._take_imu(message)
         elif isinstance(message, FlowBatch | DepthBatch):
@@ -155,9 +160,9 @@ class OptimizerStage:
             k += 1
         return k
 
-    def _advance(self) -> list[Velocity]:
+    def _advance(self) -> list[Velocity | Odometry]:
         """Everything that can be done now, in sensor-time order."""
-        out: list[Velocity] = []
+        out: list[Velocity | Odometry] = []
         while self._tick >= 0:
             tau = self._tick_ns(self._tick)
             complete = self._take_in_order(tau)
@@ -168,7 +173,8 @@ class OptimizerStage:
                     break
                 self._count("velocity.without_batch")
                 self._take_out_of_order(tau)
-            out.append(self._velocity(tau))
+            velocity = self._velocity(tau)
+            out += [velocity, *self._reckon(velocity)]
             self._tick += 1
         return out
 
@@ -236,6 +242,13 @@ class OptimizerStage:
         state, reason, valid = self._judge(tau, v, cov)
         self._seq += 1
         return Velocity(self._seq - 1, tau, v, cov, valid, state, reason, *self._newest)
+
+    def _reckon(self, velocity: Velocity) -> list[Odometry]:
+        attitude = self._estimator.attitude(velocity.t_ns)
+        if not velocity.valid or attitude is None:
+            self._reckoning.stop()
+            return []
+        return [self._reckoning.update(velocity.t_ns, velocity.v_B, velocity.cov, *attitude)]
 
     def _judge(self, tau: int, v: np.ndarray, cov: np.ndarray) -> tuple[str, str, bool]:
         """State, reason and validity of an estimate."""

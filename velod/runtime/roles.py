@@ -14,7 +14,7 @@ from velod.runtime.dispatching import BatchDispatch
 from velod.runtime.inbox import Item
 from velod.runtime.shell import WorkerShell
 from velod.runtime.stages import Stage
-from velod.types import DepthBatch, Done, EventBatch, FlowBatch, ImuSamples, Message, StereoBatch, Velocity
+from velod.types import DepthBatch, Done, EventBatch, FlowBatch, ImuSamples, Message, Odometry, StereoBatch, Velocity
 from velod.wire import Envelope
 from velod.wire.topics import (
     ALIVE,
@@ -26,6 +26,7 @@ from velod.wire.topics import (
     FLOW,
     IMU,
     IMU_SENSOR,
+    ODOMETRY,
     VELOCITY,
     Topic,
     key,
@@ -162,6 +163,8 @@ class OptimizerShell(WorkerShell):
             if len(self._origin_ns) > self._REMEMBERED:
                 del self._origin_ns[next(iter(self._origin_ns))]
         for output in outputs:
+            if isinstance(output, Odometry):
+                self.outlet.publish(ODOMETRY, output)
             if not isinstance(output, Velocity):
                 continue
             batch = (output.batch_seq, output.batch_t_ns)

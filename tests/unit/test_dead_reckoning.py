@@ -1,0 +1,99 @@
+"""Dead reckoning: one integration of the velocity, kept upright by gravity."""
+
+import numpy as np
+
+from tests.synthetic import CALIBRATION, FLIGHT, messages
+from velod.config import from_tree
+from velod.geometry.so3 import exp, matrix_from_quaternion
+from velod.optimizer.dead_reckoning import DeadReckoning, upright
+from velod.optimizer.stage import OptimizerStage
+from velod.types import Odometry, Velocity
+
+
+def reckon_flight(reckoning, seconds=2.0, hz=200):
+    """The exact flight; the last message and the true way from the start, in O."""
+    t = np.arange(int(seconds * hz) + 1) / hz
+    for ti in t:
+        R_WB = FLIGHT.R_WB(ti)
+        out = reckoning.update(int(ti * 1e9), FLIGHT.v_B(ti), np.eye(3) * 1e-4, R_WB, R_WB.T @ [0.0, 0.0, 9.81])
+    v_W = np.array([FLIGHT.R_WB(ti) @ FLIGHT.v_B(ti) for ti in t])
+    way_W = ((v_W[1:] + v_W[:-1]) / 2 / hz).sum(axis=0)
+    R_OW = upright(np.eye(3), FLIGHT.R_WB(0.0).T @ [0.0, 0.0, 9.81]) @ FLIGHT.R_WB(0.0).T
+    return out, R_OW @ way_W, R_OW
+
+
+def test_an_exact_velocity_is_integrated_to_the_true_way_and_attitude():
+    out, way_O, R_OW = reckon_flight(DeadReckoning(1.0, 1e-3))
+    assert np.linalg.norm(way_O) > 3.0
+    assert np.linalg.norm(out.p_OB - way_O) < 1e-3
+    assert np.allclose(matrix_from_quaternion(out.q_OB), R_OW @ FLIGHT.R_WB(2.0), atol=1e-6)
+    assert abs(out.distance_m - np.linalg.norm(way_O)) < 1.0
+    assert out.distance_m >= np.linalg.norm(out.p_OB)
+
+
+def test_upright_puts_gravity_along_z_whatever_the_attitude():
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        R, g_B = exp(rng.normal(size=3) * 2), rng.normal(size=3)
+        assert np.allclose(upright(R, g_B) @ g_B / np.linalg.norm(g_B), [0.0, 0.0, 1.0], atol=1e-12)
+    assert np.allclose(upright(np.eye(3), np.array([0.0, 0.0, -9.81])) @ [0.0, 0.0, -1.0], [0.0, 0.0, 1.0])
+
+
+def test_gravity_takes_out_the_tilt_that_the_gyroscope_gathers():
+    reckoning = DeadReckoning(1.0, 1e-3)
+    for k in range(1000):
+        drift = exp(np.array([2e-3 * k, 0.0, 0.0]))  # the gyroscope says it turns; gravity that it does not
+        out = reckoning.update(
+            k * 5_000_000, np.array([1.0, 0.0, 0.0]), np.eye(3) * 1e-4, drift, np.array([0, 0, 9.81])
+        )
+    assert np.allclose(matrix_from_quaternion(out.q_OB), np.eye(3), atol=1e-9)
+    assert np.allclose(out.p_OB, [999 * 5e-3, 0.0, 0.0], atol=1e-9)
+
+
+def test_the_covariance_is_that_of_velocity_errors_that_last():
+    """Errors drawn anew every correlation time, on a straight way: the end points scatter as the covariance says."""
+    sigma, tau, dt, steps = 0.05, 0.5, 0.01, 1000
+    rng, ends = np.random.default_rng(1), []
+    for _ in range(200):
+        # first-order Gauss-Markov error
+        error, decay = rng.normal(size=3) * sigma, np.exp(-dt / tau)
+        p = np.zeros(3)
+        for _ in range(steps):
+            error = decay * error + np.sqrt(1 - decay**2) * sigma * rng.normal(size=3)
+            p += error * dt
+        ends.append(p)
+    reckoning = DeadReckoning(tau, 1e-9)
+    for k in range(steps + 1):
+        out = reckoning.update(k * 10_000_000, np.zeros(3), np.eye(3) * sigma**2, np.eye(3), np.array([0, 0, 9.81]))
+    assert np.allclose(np.sqrt(np.diag(out.cov)), np.std(ends), rtol=0.15)
+
+
+def test_the_heading_error_grows_across_the_way():
+    reckoning = DeadReckoning(1.0, 0.05)
+    for k in range(1001):
+        out = reckoning.update(
+            k * 10_000_000, np.array([2.0, 0.0, 0.0]), np.zeros((3, 3)), np.eye(3), np.array([0, 0, 9.81])
+        )
+    assert out.cov[1, 1] > 1.0
+    assert out.cov[0, 0] < 1e-9
+
+
+def test_a_lost_velocity_begins_a_new_reckoning():
+    reckoning = DeadReckoning(1.0, 1e-3)
+    reckon_flight(reckoning, 1.0)
+    reckoning.stop()
+    out = reckoning.update(7_000_000_000, np.ones(3), np.eye(3), np.eye(3), np.array([0.0, 0.0, 9.81]))
+    assert out.origin_t_ns == 7_000_000_000
+    assert not out.p_OB.any()
+
+
+def test_every_valid_velocity_of_the_optimizer_comes_with_its_reckoning():
+    stage = OptimizerStage(from_tree({}), CALIBRATION)
+    out = [v for m in messages(FLIGHT, 1.5) for v in stage.handle(m)]
+    valid = [v.t_ns for v in out if isinstance(v, Velocity) and v.valid]
+    reckoned = [o for o in out if isinstance(o, Odometry)]
+    assert [o.t_ns for o in reckoned] == valid
+    first, last = reckoned[0], reckoned[-1]
+    times = np.linspace(first.t_ns, last.t_ns, 2000) * 1e-9
+    way = np.trapezoid([np.linalg.norm(FLIGHT.v_B(t)) for t in times], times)
+    assert abs(last.distance_m / way - 1.0) < 0.02
