@@ -1,6 +1,6 @@
 """Flow, depth and IMU messages made from an analytic motion: what a perfect front end would say, with noise."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -42,6 +42,22 @@ FLIGHT = Motion(
 SPIN = Motion(
     np.array([2.0, -12.0, 5.0]), np.array([1.0, 2.0, 0.0]), np.array([3.0, 3.0, 1.0]), np.array([6.0, 5.0, 7.0])
 )
+
+
+class Braking(Motion):
+    """Comes to rest smoothly within ``BRAKED_S``, without turning."""
+
+    BRAKED_S = 0.8
+
+    def v_B(self, t):
+        return self.R_WB(t).T @ self.v0_W * max(0.0, 1 - t / self.BRAKED_S) ** 2
+
+    def accel(self, t):
+        slowing = -2 * max(0.0, 1 - t / self.BRAKED_S) / self.BRAKED_S
+        return self.R_WB(t).T @ (self.v0_W * slowing + G_W)
+
+
+REST = Motion(np.zeros(3), np.zeros(3), np.zeros(3), np.ones(3))
 
 
 @cache
@@ -120,3 +136,10 @@ def _front_end(motion, rng, seq, end_ns, period_ns, m, noise, outliers):
 def errors(velocities, motion):
     """|v - truth| of the valid velocities, m/s."""
     return np.array([np.linalg.norm(v.v_B - motion.v_B(v.t_ns * 1e-9)) for v in velocities if v.valid])
+
+
+def renumber(stream, by):
+    """The messages as another ingest would number them: every seq + ``by``."""
+    for m in stream:
+        batch = {"batch_seq": m.batch_seq + by} if isinstance(m, ImuSamples) else {}
+        yield replace(m, seq=m.seq + by, **batch)

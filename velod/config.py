@@ -156,6 +156,7 @@ class OptimizerSettings:
     shared_error: float = _f(
         10.0, "information of a batch is divided by this for errors its flows share", lo=1.0, hi=100.0
     )
+    zero_velocity: bool = _f(True, "rest is observed as zero velocity: no moving events and a quiet IMU")
     ransac_iterations: int = _f(64, "minimal samples of the linear solver (Eq. 15)", lo=8, hi=10_000)
     min_flows: int = _f(12, "flows with a depth that a batch must have", lo=6, hi=10_000)
     seed: int = _f(1, "of all random choices", lo=0, hi=2**31 - 1)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.synthetic import CALIBRATION, FLIGHT, SPIN, errors, messages
+from tests.synthetic import CALIBRATION, FLIGHT, REST, SPIN, Braking, Motion, errors, messages, renumber
 from velod.config import from_tree
 from velod.optimizer.stage import OptimizerStage
 from velod.types import DepthBatch, FlowBatch, ImuSamples, Velocity
@@ -135,15 +135,7 @@ def test_before_any_flow_the_estimate_is_not_valid():
 
 def test_a_restarted_ingest_is_followed():
     first, second = messages(FLIGHT, 0.6), messages(FLIGHT, 1.2)
-    seq0 = 50  # its batches 50.. become 0.. of the new ingest
-    renumbered = []
-    for m in second:
-        if m.seq < seq0:
-            continue
-        fields = {k: getattr(m, k) for k in m.__slots__} | {"seq": m.seq - seq0}
-        if isinstance(m, ImuSamples):
-            fields["batch_seq"] = m.batch_seq - seq0
-        renumbered.append(type(m)(**fields))
+    renumbered = renumber((m for m in second if m.seq >= 50), -50)
     velocities, stage = run([*first, *renumbered])
     assert stage.counters["ingest.restart"] == 1
     assert velocities[-1].t_ns > 1.1e9
@@ -189,3 +181,35 @@ def test_flow_without_depth_waits_for_it():
     no_depth = [m for m in stream if not (isinstance(m, DepthBatch) and m.seq >= 10)]
     velocities, _ = run(no_depth, max_wait_ms=float("inf"))
     assert velocities[-1].t_ns < 11 * 15e6
+
+
+def test_a_sensor_that_starts_at_rest_says_zero():
+    velocities, stage = run(messages(REST, 1.5, dark=(0.0, 9.0)))
+    first = next(v for v in velocities if v.valid)
+    assert first.t_ns < 0.5e9
+    assert errors(velocities, REST).max() < 0.05
+    assert velocities[-1].state == "tracking"
+    assert stage.counters["standstill"] > 50
+
+
+def test_a_sensor_that_comes_to_rest_stays_known():
+    """Rest for 3 s without an event: the covariance does not grow, as it does without the detection."""
+    braking = Braking(np.zeros(3), np.array([2.0, 1.0, 0.3]), np.zeros(3), np.zeros(3))
+    stream = messages(braking, 4.0, dark=(0.8, 9.0))
+    with_it, _ = run(stream)
+    without, _ = run(stream, zero_velocity=False)
+    late = [v for v in with_it if v.t_ns > 1.2e9]
+    assert late and all(v.valid and v.state == "tracking" for v in late)
+    assert errors(late, braking).max() < 0.05
+    assert np.trace(without[-1].cov) > 20 * np.trace(with_it[-1].cov)
+
+
+def test_a_dark_flight_is_not_taken_for_rest():
+    _, stage = run(messages(FLIGHT, 1.2, dark=(0.5, 1.2)))
+    assert "standstill" not in stage.counters
+
+
+def test_a_static_scene_seen_by_a_vibrating_sensor_is_not_taken_for_rest():
+    shaking = Motion(np.zeros(3), np.zeros(3), np.array([0.02, 0.0, 0.03]), np.full(3, 60.0))
+    _, stage = run(messages(shaking, 1.0, dark=(0.0, 9.0)))
+    assert "standstill" not in stage.counters

@@ -14,6 +14,7 @@ from velod.optimizer import flow_equation, inertial_residual
 from velod.optimizer.flow_equation import Fit, Measured, Rows
 from velod.optimizer.inertial import InertialMemory
 from velod.optimizer.preintegration import Preintegration, preintegrate
+from velod.optimizer.standstill import QUIET_NS, Standstill
 from velod.optimizer.window import Window
 from velod.types import F64, NS_PER_S, DepthBatch, FlowBatch, ImuSamples
 
@@ -23,6 +24,8 @@ SMOOTHNESS = {"error": 0.5, "velocity": 5.0}
 """Weak sigma of the second difference of control points, m/s, by what the spline models."""
 INNOVATION_GATE = 25.0
 """Squared Mahalanobis distance from which a batch that contradicts the prediction loses weight (5 sigma)."""
+STANDSTILL_SIGMA = 0.05
+"""m/s, of a velocity observed as zero at the end of one batch."""
 MAX_INTEGRATED = 1000.0
 """m/s; s_L, which gravity makes grow without end, is counted anew beyond this."""
 MAX_CARRIED = 32
@@ -66,6 +69,7 @@ class Estimator:
         self.counters: dict[str, int] = {}
         self.memory = InertialMemory(o.window_s + 3.0)
         self._segments = int(np.ceil(o.window_s / o.knot_s)) + 1
+        self._standstill = Standstill(settings.imu)
         self._forget()
 
     def _forget(self) -> None:
@@ -89,16 +93,19 @@ class Estimator:
             self._count("estimate.restart_after_hole")
             self._forget()
         rows = self._rows(flow, depth)
+        still = self._o.zero_velocity and self._standstill.detected(flow, self.memory, self._biases()[1])
         if self.window.empty:
-            if rows is None:
+            if rows is None and not still:
                 return
-            self._start(int(rows[0].t_ns.min()))
+            self._start(flow.t_ns - QUIET_NS if rows is None else int(rows[0].t_ns.min()))
         late = self.head is not None and flow.t_ns <= self.head.t_ns
         predicted = None if late or self.head is None else self.predict(flow.t_ns)
         if not late:
             self._extend_to(flow.t_ns)
         if rows is not None:
             self._add_flow(flow.t_ns, *rows, predicted)
+        elif still and not late:
+            self._add_standstill(flow.t_ns)
         self._solve_head(self.head.t_ns if late and self.head is not None else flow.t_ns)
         self._keep_error_small()
 
@@ -232,6 +239,14 @@ class Estimator:
             self.window.add_information(info.t_ns, info.L, info.eta)
         self.batches += 1
         self.last_usable_t_ns = max(self.last_usable_t_ns, t_ns)
+
+    def _add_standstill(self, t_ns: int) -> None:
+        """v_B = 0 at ``t_ns``, as an observation."""
+        _, N, M = self._frame(t_ns)
+        self.window.add(M @ self.window.spline_row(t_ns), -N, np.eye(3) / STANDSTILL_SIGMA**2)
+        self._count("standstill")
+        self.batches += 1
+        self.last_usable_t_ns = t_ns
 
     def _innovation(self, t_ns: int, fit: Fit, predicted: tuple[F64, F64]) -> float:
         """Squared Mahalanobis distance of the batch's own velocity from the predicted one."""
