@@ -16,7 +16,7 @@ from velod.cli_report import Line, progress_bar, write_json
 from velod.config import Settings
 from velod.eval.baselines import benosman_settings, integrate_imu, paper_settings
 from velod.eval.compare import Case, compare, judge
-from velod.eval.floor import TrueDepth, with_perfect_flow_and_depth
+from velod.eval.floor import TrueDepth, has_floor, with_perfect_flow_and_depth
 from velod.eval.front_end import FrontEnd, SecondFlow, estimate
 from velod.eval.metrics import evaluate
 from velod.eval.report import Report, StageTimes
@@ -161,10 +161,10 @@ def _stage_errors(recording: Recording, case: Case) -> StageErrors | None:
 
 
 def _true_depth_of(recording: Recording) -> TrueDepth | None:
-    """The simulator's, where it knows the recording."""
+    """The simulator's, where it knows the recording and the cameras are such that it can say."""
     from velod.sim.true_depth import recipe_of, true_depth
 
-    if recording.truth is None or not recording.path.is_file():
+    if recording.truth is None or not recording.path.is_file() or not has_floor(recording.calibration):
         return None
     recipe = recipe_of(recording.truth, read_depth(recording.path))
     return None if recipe is None else lambda t_ns, x, y: true_depth(recipe, t_ns, x, y)

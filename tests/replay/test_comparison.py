@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -47,6 +48,13 @@ def test_the_floor_is_what_its_covariance_says_of_the_imus_noise_alone(compared:
 def test_the_floor_of_eval_is_the_one_of_the_table(simulated: Callable[[str, float], Path], compared: Path) -> None:
     recording = open_recording(simulated("boxes-4", 0.6))
     assert floor_mps(Settings(), recording) == pytest.approx(ave(compared, "floor"), abs=1e-12)
+
+
+def test_a_rig_that_the_floor_cannot_be_had_for_has_none(simulated: Callable[[str, float], Path]) -> None:
+    recording = open_recording(simulated("boxes-4", 0.6))
+    lens = replace(recording.calibration.left, model="equi", dist=(0.1, 0.0, 0.0, 0.0))
+    distorted = replace(recording, calibration=replace(recording.calibration, left=lens, right=lens))
+    assert floor_mps(Settings(), distorted) is None
 
 
 def test_the_page_holds_everything_and_asks_for_nothing_else(compared: Path) -> None:

@@ -29,6 +29,11 @@ class FloorError(ValueError):
     """No floor can be had for this rig; the text says why."""
 
 
+def has_floor(calibration: Calibration) -> bool:
+    """Whether the cameras are free of distortion and the left one is the body: all that the floor can be had for."""
+    return calibration.left.model == "none" and bool(np.array_equal(calibration.T_cam_imu, np.eye(4)))
+
+
 def with_perfect_flow_and_depth(
     front_end: FrontEnd, calibration: Calibration, truth: Truth, true_depth: TrueDepth
 ) -> FrontEnd:
@@ -37,7 +42,7 @@ def with_perfect_flow_and_depth(
     Raises FloorError unless the cameras are free of distortion and the left one is the body.
     """
     camera = calibration.left
-    if camera.model != "none" or not np.array_equal(calibration.T_cam_imu, np.eye(4)):
+    if not has_floor(calibration):
         raise FloorError("the floor needs undistorted cameras, and the left one as body")
     f_b = camera.fx * -float(calibration.t_RL[0])
 
