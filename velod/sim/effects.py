@@ -39,18 +39,18 @@ class Effects:
     clock_offset_us: int = 0  # of the right camera: its stamps are so much later
 
     def __post_init__(self) -> None:
-        """Raises EffectError."""
+        """Raises SensorError."""
         for name in ("noise_hz", "hot_share", "leak_hz", "bandwidth_hz", "jitter_us", "quantum_us", "bus_mev_s"):
             if not 0.0 <= getattr(self, name) < math.inf:
-                raise EffectError(f"{name} must be zero or more and finite, got {getattr(self, name):g}")
+                raise SensorError(f"{name} must be zero or more and finite, got {getattr(self, name):g}")
         if self.hot_share > 1.0:
-            raise EffectError(f"hot_share must be at most 1, got {self.hot_share:g}")
+            raise SensorError(f"hot_share must be at most 1, got {self.hot_share:g}")
         if len(self.radtan) not in (0, 5) or not all(math.isfinite(k) for k in self.radtan):
-            raise EffectError(f"radtan must be five finite numbers k1 k2 p1 p2 k3, got {self.radtan}")
+            raise SensorError(f"radtan must be five finite numbers k1 k2 p1 p2 k3, got {self.radtan}")
 
 
-class EffectError(ValueError):
-    """An effect that no sensor can have; the text names it."""
+class SensorError(ValueError):
+    """What no sensor can do; the text names it."""
 
 
 class Noise:

@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 
 from velod.io.model import EventColumns
-from velod.sim.effects import Effects, Noise, merged
+from velod.sim.effects import Effects, Noise, SensorError, merged
 from velod.types import F32, I64, U8, U16
 
 LOG_EPS = 1e-3
@@ -27,6 +27,11 @@ class EventModel:
     threshold: float = 0.5  # C, contrast in log intensity
     threshold_sigma: float = 0.021  # spread of C from pixel to pixel and between the polarities
     refractory_us: int = 100  # a pixel is blind so long after an event
+
+    def __post_init__(self) -> None:
+        """Raises SensorError."""
+        if not (self.threshold > 0.0 and 0.0 <= self.threshold_sigma < float("inf") and self.refractory_us >= 0):
+            raise SensorError(f"contrasts must be positive, spread and refractory period not negative: {self}")
 
 
 class EventSensor:

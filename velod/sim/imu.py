@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from velod.io.model import Imu
+from velod.sim.effects import SensorError
 from velod.sim.trajectory import Trajectory
 from velod.types import F64
 
@@ -18,11 +19,16 @@ GRAVITY_W = np.array([0.0, 0.0, 9.81])
 class ImuModel:
     """Noise as continuous-time densities: a sample's sigma is density * sqrt(rate)."""
 
-    rate_hz: int = 200
+    rate_hz: int = 200  # a whole number of microseconds apart
     accel_noise: float = 1.86e-2  # m/s^2/sqrt(Hz)
     gyro_noise: float = 1.86e-3  # rad/s/sqrt(Hz)
     accel_bias_walk: float = 4.33e-3  # m/s^2/sqrt(s)
     gyro_bias_walk: float = 2.66e-4  # rad/s/sqrt(s)
+
+    def __post_init__(self) -> None:
+        """Raises SensorError."""
+        if self.rate_hz <= 0 or 1_000_000 % self.rate_hz != 0:
+            raise SensorError(f"the IMU's rate must divide 1,000,000 Hz, got {self.rate_hz}")
 
     def noiseless(self) -> ImuModel:
         return ImuModel(self.rate_hz, 0.0, 0.0, 0.0, 0.0)

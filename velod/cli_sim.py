@@ -1,0 +1,64 @@
+"""``velod sim``: what of a sequence's recipe the command line can change."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from velod.sim import Sequence
+
+# Option, field of velod.sim.effects.Effects, type, unit, help.
+_EFFECTS: tuple[tuple[str, str, Callable[[str], object], str, str], ...] = (
+    ("--noise", "noise_hz", float, "HZ", "background events of each pixel (real: 0.1 to 5)"),
+    ("--hot-pixels", "hot_share", float, "SHARE", "of the pixels that fire at 500 Hz on their own (real: 1e-4)"),
+    ("--leak", "leak_hz", float, "HZ", "ON events of each pixel where nothing changes (real: 0.1)"),
+    ("--bandwidth", "bandwidth_hz", float, "HZ", "low-pass of each pixel at full intensity, less in the dark"),
+    ("--jitter", "jitter_us", float, "US", "standard deviation of a time stamp"),
+    ("--quantum", "quantum_us", int, "US", "time stamps are multiples of it (200 with some drivers)"),
+    ("--bus", "bus_mev_s", float, "MEV/S", "events that a camera can read out; more wait up to 1 ms, then are lost"),
+    ("--clock-offset", "clock_offset_us", int, "US", "the right camera's stamps are so much later"),
+)
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """IMU rate and real-sensor effects."""
+    parser.add_argument(
+        "--imu-hz", type=int, metavar="HZ", help="rate of the IMU, a divisor of 1,000,000 (default 200)"
+    )
+    group = parser.add_argument_group("real-sensor effects", "All off unless given.")
+    group.add_argument(
+        "--threshold-spread", type=float, metavar="C", help="mismatch of the thresholds of 0.5 (sigma; default 0.021)"
+    )
+    for option, field, kind, unit, text in _EFFECTS:
+        group.add_argument(option, dest=field, type=kind, default=0, metavar=unit, help=text)
+    group.add_argument(
+        "--distortion", type=_coefficients, default=(), metavar="K1,K2,P1,P2,K3", help="radtan, of both lenses"
+    )
+
+
+def recipe_of(args: argparse.Namespace) -> Sequence:
+    """The sequence that the arguments ask for. Raises SequenceError, SensorError."""
+    from velod.sim import sequence
+    from velod.sim.effects import Effects
+
+    recipe = sequence(args.sequence)
+    effects = Effects(radtan=args.distortion, **{field: getattr(args, field) for _, field, *_ in _EFFECTS})
+    events, imu = recipe.events, recipe.imu
+    if args.threshold_spread is not None:
+        events = replace(events, threshold_sigma=args.threshold_spread)
+    if args.imu_hz is not None:
+        imu = replace(imu, rate_hz=args.imu_hz)
+    return replace(recipe, effects=effects, events=events, imu=imu)
+
+
+def _coefficients(text: str) -> tuple[float, ...]:
+    try:
+        values = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"not numbers: {text!r}") from None
+    if len(values) != 5:
+        raise argparse.ArgumentTypeError(f"must be five numbers, got {len(values)}")
+    return values
