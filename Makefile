@@ -23,6 +23,8 @@ check: $(DEV)
 
 bench: $(DEV)
 	$(BIN)/python -m pytest tests/bench
+	mkdir -p out
+	$(BIN)/velod bench all --json out/bench.json
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

@@ -1,10 +1,11 @@
 """A sensor driver with nothing of velod: only eclipse-zenoh, msgpack and numpy. docs/driver.md explains each step.
 
-    velod run -c velod.toml                        in another terminal
+    velod run --calibration examples/rig.yaml      in another terminal
     python examples/driver.py [tcp/HOST:17447]
+    velod echo                                     in a third one: 1.25 m/s along -x
 
-The "camera" below sees a bar that moves to the right at 100 px/s, and the "IMU" lies still: take their place with
-the calls of your camera's SDK.
+The "cameras" below see slanted edges that move to the right at 100 px/s and 8 px of disparity, and the "IMU" feels no
+acceleration, so the rig moves to the left at 1.25 m/s. Take their place with the calls of your camera's SDK.
 """
 
 import contextlib
@@ -19,6 +20,13 @@ import zenoh
 RIG = "rig0"
 PERIOD_NS = 5_000_000  # a packet every 5 ms of sensor time
 NOISE = np.random.default_rng(1)
+
+# When an edge first reaches each pixel; the next one follows 64 px or 0.64 s behind. They lean to the right in the
+# upper half of the image and to the left in the lower half: edges of one direction would show motion across it only.
+ROW, COLUMN = np.mgrid[:260, :346]
+EDGE_PERIOD_NS = 640_000_000
+REACHED_NS = ((COLUMN + np.where(ROW < 130, 0.5, -0.5) * ROW) * 10e6).astype(np.int64)
+DISPARITY_NS = {"left": 0, "right": 80_000_000}
 
 
 def event_packet(seq, watermark_ns, camera, t_ns, x, y, p):
@@ -61,15 +69,15 @@ def imu_packet(seq, t_ns, accel, gyro):
 
 def read_camera(camera, start_ns, end_ns):
     """Stands for your SDK: the events of start_ns <= t < end_ns."""
-    y = np.arange(260)
-    column = int(start_ns * 100e-9) % 340
-    column -= 8 if camera == "right" and column >= 8 else 0
-    t_ns = np.linspace(start_ns, end_ns - 1, len(y)).astype(np.int64)
-    return t_ns, np.full(len(y), column), y, np.ones(len(y))
+    wait_ns = (REACHED_NS + DISPARITY_NS[camera] - start_ns) % EDGE_PERIOD_NS
+    y, x = np.nonzero(wait_ns < end_ns - start_ns)
+    t_ns = start_ns + wait_ns[y, x]
+    order = np.argsort(t_ns, kind="stable")
+    return t_ns[order], x[order], y[order], np.ones(len(order))
 
 
 def read_imu(start_ns):
-    """Stands for your SDK: one sample of a camera that lies level and still (y points down)."""
+    """Stands for your SDK: one sample of a level rig without acceleration (y points down)."""
     # Noise, as any real IMU has: velod takes one that repeats itself for frozen.
     accel, gyro = NOISE.normal(0.0, 0.02, (2, 1, 3))
     return np.array([start_ns]), accel + np.array([0.0, -9.81, 0.0]), gyro

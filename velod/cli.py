@@ -58,7 +58,7 @@ def _demo(args: argparse.Namespace) -> int:
 def _run(args: argparse.Namespace) -> int:
     from velod.cli_run import run
 
-    return run(args.config, args.only, args.connect, args.worker)
+    return run(args.config, args.calibration, args.only, args.connect, args.worker)
 
 
 def _replay(args: argparse.Namespace) -> int:
@@ -167,6 +167,7 @@ first steps:
   velod demo                         see it run on simulated sensors, judged against the truth
   velod replay recording.h5          a recording through the same processes, in real time
   velod eval recording.h5 --offline  how good it is, where the recording holds the truth
+  velod config init velod.toml       all settings, each with its meaning
   velod run -c velod.toml            the service beside a sensor driver
   velod echo                         what it says, from another terminal
 `velod COMMAND --help` has worked examples for each command.""",
@@ -277,13 +278,17 @@ def _add_run(commands: _Commands[argparse.ArgumentParser]) -> None:
         "The service beside a sensor driver: ingest, flow, depth, optimizer.",
         "Starts the processes, starts dead ones again, and ends them all on Ctrl-C or SIGTERM. A driver publishes\n"
         "velod/<rig>/sensor/events/<left|right> and velod/<rig>/sensor/imu (docs/driver.md).",
-        "  velod run -c velod.toml                       everything on this host\n"
+        "  velod run --calibration rig.yaml              everything on this host, default settings\n"
+        "  velod run -c velod.toml                       with your settings, rig.calibration among them\n"
         "  velod run --only flow --connect tcp/10.0.0.5:17447 --worker flow-1\n"
         "                                                one more flow worker, for a velod on 10.0.0.5\n"
         "  velod run -c velod.toml --only ingest,optimizer\n"
         "                                                only these here; flow and depth run elsewhere",
     )
     _add_config_option(parser)
+    parser.add_argument(
+        "--calibration", metavar="FILE", help="of the rig (velod, Kalibr, ROS), instead of rig.calibration"
+    )
     parser.add_argument("--only", type=_stages, metavar="STAGE[,STAGE]", help="only these stages on this host")
     parser.add_argument("--connect", metavar="ENDPOINT", help="join the velod there; settings come from it")
     parser.add_argument("--worker", metavar="NAME", help="name of the worker, with one stage in --only (flow-1)")
@@ -334,7 +339,9 @@ def _add_eval(commands: _Commands[argparse.ArgumentParser]) -> None:
         help="simulate the sequences of Table I (kept) and judge velod and its baselines beside the paper",
     )
     parser.add_argument("--quick", action="store_true", help="with --table: a second of each, one IMU noise")
-    parser.add_argument("--report", metavar="DIR", help="compare with the baselines; write report.html and pictures")
+    parser.add_argument(
+        "--report", metavar="DIR", help="compare with the baselines, offline; write report.html and pictures"
+    )
 
 
 def _add_sim(commands: _Commands[argparse.ArgumentParser]) -> None:
@@ -362,7 +369,8 @@ def _add_echo(commands: _Commands[argparse.ArgumentParser]) -> None:
         "echo",
         _echo,
         "Print messages as they come.",
-        "Topics: velocity, health, flow, depth, imu, events, imu_sensor, done. Arrays are shown by shape and range.",
+        "Topics: velocity, odometry, health; events, imu_sensor (from the driver); batch_flow, batch_depth, flow,\n"
+        "depth, imu, done (between the processes). Arrays are shown by shape and range.",
         "  velod echo                            velocities of the velod on this host\n"
         "  velod echo health -n 4                four health messages, then stop\n"
         "  velod echo velocity --connect tcp/10.0.0.5:17447",
@@ -404,17 +412,21 @@ examples:
   velod config calibration camchain.yaml  read a calibration (velod, Kalibr, ROS) and show it as velod's YAML""",
     )
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
-    show = actions.add_parser("show", help="print the settings in effect")
+
+    def action(name: str, what: str) -> argparse.ArgumentParser:
+        return actions.add_parser(name, help=what, description=f"{what[0].upper()}{what[1:]}.")
+
+    show = action("show", "print the settings in effect: the file's, and the defaults for the rest")
     _add_config_option(show)
     show.set_defaults(command=_config_show)
-    init = actions.add_parser("init", help="write all settings with their meaning and defaults")
-    init.add_argument("file", metavar="FILE", nargs="?", default="velod.toml")
+    init = action("init", "write all settings with their meaning and defaults")
+    init.add_argument("file", metavar="FILE", nargs="?", default="velod.toml", help="default velod.toml")
     init.add_argument("--force", action="store_true", help="overwrite an existing file")
     init.set_defaults(command=_config_init)
-    check = actions.add_parser("check", help="whether velod would take a settings file")
+    check = action("check", "say whether velod would take a settings file, and the calibration that it names")
     check.add_argument("file", metavar="FILE")
     check.set_defaults(command=_config_check)
-    calibration = actions.add_parser("calibration", help="read a calibration and show it as velod's YAML")
+    calibration = action("calibration", "read a calibration and show it as velod's YAML")
     calibration.add_argument(
         "file", metavar="FILE", help="velod's own, Kalibr's camchain, or the left.yaml of a ROS pair"
     )
@@ -445,7 +457,8 @@ def _add_warmup(commands: _Commands[argparse.ArgumentParser]) -> None:
         "warmup",
         _warmup,
         "Compile the numerical kernels now, so that the first run need not.",
-        "About half a minute the first time. What was compiled is kept beside the package, or under NUMBA_CACHE_DIR.",
+        "Those of the stages and of the simulator; half a minute to a minute the first time. What was\n"
+        "compiled is kept beside the package, or under NUMBA_CACHE_DIR.",
         "  velod warmup                          after installing, or when building an image",
     )
 

@@ -49,8 +49,8 @@ def init(path: str, *, force: bool) -> int:
 
 def check(path: str) -> int:
     """Say whether velod would take a settings file, and the calibration that it names."""
-    calibration_of(config.load(path))
-    print(f"{path}: good")
+    named = calibration_of(config.load(path)) is not None
+    print(f"{path}: good" + ("" if named else "; rig.calibration is empty, and `velod run` needs one"))
     return 0
 
 

@@ -11,14 +11,18 @@ from velod.cli_config import calibration_of, settings_of
 from velod.config import ConfigError, Settings
 
 
-def run(config: str | None, only: list[str] | None, connect: str | None, worker: str | None) -> int:
+def run(
+    config: str | None, calibration_file: str | None, only: list[str] | None, connect: str | None, worker: str | None
+) -> int:
     """Keep the service's processes alive until SIGINT or SIGTERM. Raises ConfigError, SessionError, ..."""
-    settings = settings_of(config)
+    settings = settings_of(config, calibration_file)
     if connect is not None:
         settings = replace(settings, zenoh=replace(settings.zenoh, connect=connect))
     calibration = calibration_of(settings)
     if calibration is None and not settings.zenoh.connect:
-        raise ConfigError(f"{config or 'defaults'}: rig.calibration: missing; the service beside a sensor needs one")
+        raise ConfigError(
+            f"{config or 'defaults'}: rig.calibration: missing; the service beside a sensor needs it or --calibration"
+        )
     from velod.runtime.stages import STAGES
     from velod.runtime.supervisor import Supervisor
     from velod.runtime.worker import start_logging, stop_on_signals

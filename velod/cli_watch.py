@@ -79,7 +79,7 @@ def origin_latency_ms(received: Received) -> float:
 
 def _value(value: Any) -> str:
     if isinstance(value, np.ndarray) and value.size <= 4:
-        return "[" + " ".join(f"{v:g}" for v in value.tolist()) + "]"
+        return "[" + " ".join(f"{v:g}" for v in value.ravel().tolist()) + "]"
     if isinstance(value, np.ndarray):
         spread = f"{value.min():g}..{value.max():g}" if value.size else "-"
         return f"{value.dtype}{list(value.shape)}({spread})"

@@ -30,7 +30,7 @@ def _f(
 @dataclass(frozen=True, slots=True)
 class RigSettings:
     name: str = _f("rig0", "name of the rig; the second part of every key, velod/<rig>/...")
-    calibration: str = _f("", "calibration file (YAML); empty: from the recording, or from the driver")
+    calibration: str = _f("", "calibration file (YAML), relative to the current directory; empty: the recording's")
 
 
 @dataclass(frozen=True, slots=True)

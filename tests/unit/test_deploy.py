@@ -24,7 +24,7 @@ PROFILES = sorted((DEPLOY / "profiles").glob("*.toml"))
 @pytest.mark.parametrize("path", PROFILES, ids=lambda path: path.stem)
 def test_velod_takes_every_profile(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["config", "check", str(path)]) == 0
-    assert capsys.readouterr().out == f"{path}: good\n"
+    assert capsys.readouterr().out.startswith(f"{path}: good")
 
 
 def test_the_default_profile_is_what_config_init_writes() -> None:

@@ -9,13 +9,32 @@ from typing import Any
 import numpy as np
 import pytest
 
+from velod.config import Settings
+from velod.geometry.calibration import load_calibration
+from velod.runtime.offline import run_offline
 from velod.types import EventPacket, ImuPacket
 from velod.wire import decode
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
 @pytest.fixture(scope="module")
 def driver() -> dict[str, Any]:
-    return runpy.run_path(str(Path(__file__).parents[2] / "examples" / "driver.py"), run_name="driver")
+    return runpy.run_path(str(EXAMPLES / "driver.py"), run_name="driver")
+
+
+def test_the_example_driver_and_its_calibration_give_the_velocity_that_it_promises(driver: dict[str, Any]) -> None:
+    packets: list[EventPacket | ImuPacket] = []
+    for seq in range(300):
+        start_ns, end_ns = seq * driver["PERIOD_NS"], (seq + 1) * driver["PERIOD_NS"]
+        for side in ("left", "right"):
+            data = driver["event_packet"](seq, end_ns, side, *driver["read_camera"](side, start_ns, end_ns))
+            packets.append(decode(data, EventPacket).message)
+        packets.append(decode(driver["imu_packet"](seq, *driver["read_imu"](start_ns)), ImuPacket).message)
+    velocities = run_offline(Settings(), load_calibration(EXAMPLES / "rig.yaml"), packets)
+    valid = np.array([v.v_B for v in velocities if v.valid])
+    assert len(valid) > 60
+    assert np.median(valid, axis=0) == pytest.approx([-1.25, 0.0, 0.0], abs=0.02)
 
 
 def test_events_of_the_example_driver_are_decoded(driver: dict[str, Any]) -> None:
