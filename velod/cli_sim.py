@@ -33,7 +33,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--threshold-spread", type=float, metavar="C", help="mismatch of the thresholds of 0.5 (sigma; default 0.021)"
     )
     for option, field, kind, unit, text in _EFFECTS:
-        group.add_argument(option, dest=field, type=kind, default=0, metavar=unit, help=text)
+        group.add_argument(option, dest=field, type=kind, default=kind("0"), metavar=unit, help=text)
     group.add_argument(
         "--distortion", type=_coefficients, default=(), metavar="K1,K2,P1,P2,K3", help="radtan, of both lenses"
     )

@@ -58,7 +58,7 @@ class Noise:
 
     def __init__(self, effects: Effects, width: int, height: int, rng: np.random.Generator) -> None:
         self._rng = rng
-        rate = np.full(width * height, effects.noise_hz)
+        rate = np.full(width * height, effects.noise_hz, np.float64)
         if effects.hot_share > 0.0:
             rate[rng.choice(rate.size, round(effects.hot_share * rate.size), replace=False)] += HOT_HZ
         self._cumulative_hz: F64 = np.cumsum(rate)

@@ -49,7 +49,7 @@ class EventSensor:
         self._last_us = np.full((height, width), -(1 << 40), np.int64)
         self._per_pixel = int(_LOG_RANGE / float(self._threshold.min())) + 1
         self._row = np.empty(width, np.float32)
-        self._leak_hz, self._bandwidth_hz = effects.leak_hz, effects.bandwidth_hz
+        self._leak_hz, self._bandwidth_hz = float(effects.leak_hz), float(effects.bandwidth_hz)
         self._noise = Noise(effects, width, height, rng)
         self._count = 0
         self._t_us: I64 = np.empty(0, np.int64)

@@ -400,9 +400,9 @@ def _sample_row(texels: F32, flat: F32, starts: U32, work: F32, intensity: F32) 
         if only > np.float32(0.0):
             intensity[i] = only
             continue
-        # log2 of the footprint between 1 and 2 texels, to 1 %.
-        e = np.sqrt(max(footprint2 / (scale * scale), one)) - one
-        share = min(e * (np.float32(1.34) - np.float32(0.34) * e), one)
+        # log2 of the footprint between 1 and 2 texels, to 1 %; beyond the coarsest level there is no more.
+        e = min(np.sqrt(max(footprint2 / (scale * scale), one)) - one, one)
+        share = e * (np.float32(1.34) - np.float32(0.34) * e)
         half_u, half_v = work[at + _HALF_U], work[at + _HALF_V]
         first = sample(texels, start, size, one / scale, u - half_u, v - half_v, share)
         second = sample(texels, start, size, one / scale, u + half_u, v + half_v, share)
