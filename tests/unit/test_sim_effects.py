@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import h5py
@@ -47,7 +48,7 @@ def read_in_batches(effects: Effects, events: EventColumns, clock_offset_us: int
     """As ``simulate`` reads out: batch by batch, then the rest."""
     readout, parts = Readout(effects, clock_offset_us, rng()), []
     edges_us = [*range(0, int(events.t_ns[-1] // 1000) + 1000, 1000)]
-    for from_us, to_us in zip(edges_us[:-1], edges_us[1:], strict=True):
+    for from_us, to_us in pairwise(edges_us):
         rows = (events.t_ns > from_us * 1000) & (events.t_ns <= to_us * 1000)
         rows |= (events.t_ns == 0) & (from_us == 0)
         batch = EventColumns(events.t_ns[rows], events.x[rows], events.y[rows], events.p[rows])
