@@ -11,12 +11,12 @@ import pytest
 
 from velod.cli_play import Played, shortcomings
 from velod.cli_report import Line, describe_velocity, progress_bar, speed_and_sigma
-from velod.cli_watch import Place, losses, table
+from velod.cli_watch import Place, describe, losses, table
 from velod.client import Received
 from velod.eval.metrics import Metrics
-from velod.types import Health, Velocity
+from velod.types import Health, ImuPacket, Message, Velocity
 from velod.wire import Envelope
-from velod.wire.topics import HEALTH
+from velod.wire.topics import HEALTH, IMU_SENSOR
 
 
 def velocity(valid: bool = True) -> Velocity:
@@ -78,6 +78,18 @@ def test_a_log_line_is_written_above_the_live_one(
     line.log("flow-0 died")
     line.finish()
     assert capsys.readouterr().err == "\r\x1b[Klive\r\x1b[Kflow-0 died\nlive\n"
+
+
+@pytest.mark.parametrize(
+    ("samples", "shown"),
+    [(1, "accel=[0.1 0 9.81]"), (5, "accel=float64[5, 3](0..9.81)"), (0, "accel=[]")],
+)
+def test_arrays_are_echoed_as_numbers_where_they_are_few_and_else_by_shape_and_range(
+    samples: int, shown: str
+) -> None:
+    accel = np.tile([0.1, 0.0, 9.81], (samples, 1))
+    packet: Message = ImuPacket(0, 5, np.arange(samples, dtype=np.int64), accel, accel)
+    assert shown in describe(Received(IMU_SENSOR, "key", Envelope(packet, 1, 0), 1, 100))
 
 
 def test_losses_are_told_from_counts_of_work() -> None:
@@ -153,7 +165,7 @@ def played(rate_hz: float) -> Played:
 
 
 def test_a_demo_that_falls_short_says_in_what() -> None:
-    assert shortcomings(played(75.0), metrics(0.05, 1.0), 75.0) == []
-    assert shortcomings(played(75.0), metrics(0.11, 1.0), 75.0) == ["AVE 0.110 m/s, at most 0.1 belongs there"]
-    text = "; ".join(shortcomings(played(50.0), metrics(float("nan"), 0.5), 75.0))
+    assert shortcomings(played(75.0), metrics(0.05, 1.0), 75.0, 0.1) == []
+    assert shortcomings(played(75.0), metrics(0.11, 1.0), 75.0, 0.1) == ["AVE 0.110 m/s, at most 0.1 belongs there"]
+    text = "; ".join(shortcomings(played(50.0), metrics(float("nan"), 0.5), 75.0, 0.1))
     assert "AVE nan m/s" in text and "only 50 %" in text and "50.0 velocities per second instead of 75" in text
