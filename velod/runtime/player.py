@@ -26,6 +26,7 @@ from velod.io.packets import Chunking
 from velod.runtime.health import HealthReporter
 from velod.runtime.outlet import Outlet
 from velod.runtime.prefetch import Prefetch
+from velod.runtime.prime import prime
 from velod.runtime.session import open_session
 from velod.runtime.stages import STAGES
 from velod.runtime.worker import (
@@ -256,6 +257,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if args.speed is not None:
             ahead.fill(PREFETCH_S)
         with open_session(zenoh_settings(args)) as session:
+            prime(session, args.rig)
             play(session, args.rig, ahead, args.speed, stop, args.worker)
     except PlayerError as e:
         log.error("%s", e)

@@ -21,6 +21,7 @@ import zenoh
 
 from velod.config import Settings
 from velod.geometry.calibration import Calibration
+from velod.runtime import prime
 from velod.runtime.health import HealthReporter
 from velod.runtime.outlet import Outlet
 from velod.runtime.process import ChildProcess, LineSink, stop_all, to_stderr
@@ -98,6 +99,7 @@ class Supervisor:
             # Health is for whoever can follow, even in a lossless replay.
             self._outlet = stack.enter_context(Outlet(self.session, self._settings.rig.name))
             self._watch_liveliness(stack)
+            stack.enter_context(prime.listen(self.session, self._settings.rig.name))
             stack.callback(self.stop_workers)
             for name in self._names():
                 self._slots[name] = _Slot(name)

@@ -43,6 +43,7 @@ ODOMETRY = Topic("odometry", "velod/{rig}/odometry", types.Odometry, 75.0, 0.0, 
 DONE = Topic("done", "velod/{rig}/done/{stage}", types.Done, 50.0, 0.0, Qos("data_high", 256))
 HEALTH = Topic("health", "velod/{rig}/health/{worker}", types.Health, 1.0, 3.0, Qos("background", 64))
 ALIVE = Topic("alive", "velod/{rig}/alive/{stage}/{worker}", None, 0.0, 0.0)
+PRIME = Topic("prime", "velod/{rig}/prime", None, 0.0, 0.0)
 CALIBRATION = Topic("calibration", "velod/{rig}/calibration", None, 0.0, 0.0)
 CONFIG = Topic("config", "velod/{rig}/config", None, 0.0, 0.0)
 
@@ -61,6 +62,7 @@ TOPICS: dict[str, Topic] = {
         DONE,
         HEALTH,
         ALIVE,
+        PRIME,
         CALIBRATION,
         CONFIG,
     )

@@ -1,0 +1,39 @@
+"""Making a session's shared memory before it is needed.
+
+Zenoh makes the pool of a session at its first large message: 0.2 s during which the process stands still, and with it
+the first batches of a run. So each process sends one large message at its start, to the supervisor, who ignores it.
+"""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+import zenoh
+
+from velod.runtime.outlet import Outlet
+from velod.wire.topics import PRIME, key
+
+log = logging.getLogger("velod")
+
+LARGE = 262_144
+"""Bytes; far above the size from which messages go through shared memory."""
+WAIT_S = 1.0
+
+
+def listen(session: zenoh.Session, rig: str) -> Any:
+    """Take what ``prime`` sends; returns the subscriber, to be kept. The supervisor's part."""
+
+    def ignore(sample: zenoh.Sample) -> None:
+        del sample
+
+    return session.declare_subscriber(key(PRIME, rig), zenoh.handlers.Callback(ignore, indirect=False))
+
+
+def prime(session: zenoh.Session, rig: str) -> None:
+    """Send one large message where somebody takes it; without a taker go on after WAIT_S."""
+    with Outlet(session, rig) as outlet:
+        if outlet.wait_for_subscriber(PRIME, WAIT_S):
+            outlet.publish_bytes(PRIME, bytes(LARGE))
+        else:
+            log.debug("nobody takes %s: the first large message will be slow", key(PRIME, rig))
