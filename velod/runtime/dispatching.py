@@ -7,9 +7,10 @@ import time
 
 from velod.runtime.dispatch import Assignment, Dispatcher
 from velod.runtime.outlet import Outlet
+from velod.runtime.prime import LARGE
 from velod.types import Done, EventBatch, StereoBatch
 from velod.wire import encode
-from velod.wire.topics import ALIVE, BATCH_DEPTH, BATCH_FLOW, Topic, parts
+from velod.wire.topics import ALIVE, BATCH_DEPTH, BATCH_FLOW, PRIME, Topic, parts
 
 WINDOW = 2
 """Batches a worker is sent before it has finished the first: one in work, one on its way."""
@@ -47,6 +48,10 @@ class BatchDispatch:
         token = parts(ALIVE, token_key)
         dispatcher = self._dispatchers.get(token["stage"])
         if dispatcher is not None:
+            if is_there:
+                self._outlet.publish_bytes(
+                    PRIME, bytes(LARGE)
+                )  # or its first batch is slow
             change = dispatcher.join if is_there else dispatcher.leave
             self._put(token["stage"], change(token["worker"], time.monotonic()))
 

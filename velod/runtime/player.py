@@ -46,6 +46,8 @@ LEAD_NS = 300_000_000
 """Lossless: how far ahead of the newest velocity, in sensor time."""
 STALL_S = 10.0
 """Without progress for so long the service is said to be stuck."""
+SETTLE_S = 0.4
+"""Between a player's start, which costs both cores for a moment, and its first packet."""
 QUIET_S = 0.5
 """No velocity for so long after the last packet: that was the last one."""
 START_S = 180.0
@@ -154,6 +156,8 @@ def play(
         outlet.wait_for_subscriber(IMU_SENSOR, STALL_S)
         outlet.wait_for_subscriber(EVENTS, STALL_S, camera="left")
         outlet.wait_for_subscriber(EVENTS, STALL_S, camera="right")
+        prime(session, rig)
+        stop.wait(SETTLE_S)
         health = HealthReporter("driver", name)
         pace = _Pace(service, speed, stop)
         last_t_ns: dict[str, int] = {}
@@ -257,7 +261,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         if args.speed is not None:
             ahead.fill(PREFETCH_S)
         with open_session(zenoh_settings(args)) as session:
-            prime(session, args.rig)
             play(session, args.rig, ahead, args.speed, stop, args.worker)
     except PlayerError as e:
         log.error("%s", e)

@@ -1,7 +1,8 @@
 """Making a session's shared memory before it is needed.
 
-Zenoh makes the pool of a session at its first large message: 0.2 s during which the process stands still, and with it
-the first batches of a run. So each process sends one large message at its start, to the supervisor, who ignores it.
+Zenoh makes the pool of a session at its first large message, and a receiver attaches to it then: up to 0.2 s during
+which a process stands still, and with it the first batches of a run. So each process sends one large message at its
+start, which all others take and ignore; ingest sends one more to greet a new worker.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ WAIT_S = 1.0
 
 
 def listen(session: zenoh.Session, rig: str) -> Any:
-    """Take what ``prime`` sends; returns the subscriber, to be kept. The supervisor's part."""
+    """Take what ``prime`` sends; returns the subscriber, to be kept."""
 
     def ignore(sample: zenoh.Sample) -> None:
         del sample

@@ -16,6 +16,7 @@ from typing import Any, ClassVar
 import zenoh
 
 from velod.config import Settings
+from velod.runtime import prime
 from velod.runtime.health import HealthReporter
 from velod.runtime.inbox import Inbox, Item
 from velod.runtime.measure import GapCounter
@@ -62,8 +63,10 @@ class WorkerShell:
         """Handle messages until ``stop`` is set; then leave nothing declared."""
         with ExitStack() as stack:
             stack.enter_context(self.outlet)
+            stack.enter_context(prime.listen(self.session, self.rig))
             self.subscribe(stack)
             self._wait_for_consumers(stop)
+            prime.prime(self.session, self.rig)
             token = key(ALIVE, self.rig, stage=self.stage_name, worker=self.worker)
             stack.enter_context(self.session.liveliness().declare_token(token))
             log.info("up")

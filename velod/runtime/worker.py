@@ -16,7 +16,6 @@ import zenoh
 
 from velod.config import Settings, ZenohSettings
 from velod.runtime import warmup
-from velod.runtime.prime import prime
 from velod.runtime.roles import SHELLS
 from velod.runtime.session import introducer_endpoint, open_session
 from velod.runtime.settings_service import fetch
@@ -40,7 +39,6 @@ def main(stage: str, argv: Sequence[str] | None = None) -> int:
         stop = stop_on_signals()
         with open_session(zenoh_settings(args)) as session:
             settings, calibration = fetch(session, args.rig, args.connect)
-            prime(session, settings.rig.name)
             built = create_stage(stage, settings, calibration)
             warmup.warm_up(stage, settings, calibration)
             serve_stage(session, settings, args.worker, built, stop)
