@@ -49,9 +49,7 @@ class BatchDispatch:
         dispatcher = self._dispatchers.get(token["stage"])
         if dispatcher is not None:
             if is_there:
-                self._outlet.publish_bytes(
-                    PRIME, bytes(LARGE)
-                )  # or its first batch is slow
+                self._outlet.publish_bytes(PRIME, bytes(LARGE))  # or its first batch is slow
             change = dispatcher.join if is_there else dispatcher.leave
             self._put(token["stage"], change(token["worker"], time.monotonic()))
 
