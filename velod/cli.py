@@ -256,7 +256,7 @@ def _add_demo(commands: _Commands[argparse.ArgumentParser]) -> None:
         "Simulates a stereo event camera and an IMU on their way through a corridor (it is kept in ~/.cache/velod),\n"
         "plays that in real time from a driver process of its own, as a camera would, and ends with the error\n"
         "against the simulated truth, rate, latency and what was dropped. It takes half a minute on two\n"
-        "cores, half of them the simulation, which the next run finds kept. Exits with 1 where the error exceeds\n"
+        "cores, half of it the simulation, which the next run finds kept. Exits with 1 where the error exceeds\n"
         "0.1 m/s (spins: 0.2 m/s), or velocities are missing or not valid.",
         "  velod demo                            5 s at 5.7 m/s along the corridor\n"
         "  velod demo --seconds 20 --csv out.csv longer; every velocity into a file\n"
