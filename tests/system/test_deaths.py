@@ -254,8 +254,8 @@ def start_service(port: int) -> tuple[subprocess.Popen[str], set[int]]:
     assert service.stderr is not None
     up = 0
     for line in service.stderr:
-        up += line.rstrip().endswith("INFO up")
-        if up == len(STAGES):
+        up += line.count("INFO up")  # two lines may come as one
+        if up >= len(STAGES):
             break
     time.sleep(1.0)
     return service, children_of(service.pid)
