@@ -23,22 +23,29 @@ CSV_COLUMNS = (
     *("t_ns", "vx", "vy", "vz"),
     *("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz"),
     *("state", "valid", "age_ms"),
+    *("bridged_ms", "up_x", "up_y", "up_z", "up_sigma", "frame"),
 )
-"""Velocity in m/s in B, covariance in (m/s)^2; age_ms: how far the IMU carried the newest measurement."""
+"""Velocity in m/s in B, covariance in (m/s)^2, up in B with the larger sigma of its direction in rad; age_ms: from
+sensor time to publication; bridged_ms: how far the IMU carried the newest measurement."""
 
 _REDRAW_S = 0.1
 _UPPER = np.triu_indices(3)
 
 
 def write_csv(path: str, velocities: Sequence[Velocity]) -> None:
-    """One line per velocity; numbers that read back exactly; ``age_ms`` is empty before the first batch."""
+    """One line per velocity; numbers that read back exactly; what is not known is empty."""
     with Path(path).open("w", newline="", encoding="utf-8") as f:
         writer = csv.writer(f)
         writer.writerow(CSV_COLUMNS)
         for v in velocities:
-            age_ms = "" if v.batch_seq < 0 else repr((v.t_ns - v.batch_t_ns) / 1e6)
+            bridged_ms = math.nan if v.batch_seq < 0 else (v.t_ns - v.batch_t_ns) / 1e6
+            further = [_number(a) for a in (v.age_ms, bridged_ms, *v.up_B, up_sigma(v))]
             numbers = [repr(float(a)) for a in (*v.v_B, *v.cov[_UPPER])]
-            writer.writerow([v.t_ns, *numbers, v.state, int(v.valid), age_ms])
+            writer.writerow([v.t_ns, *numbers, v.state, int(v.valid), *further, v.frame])
+
+
+def _number(a: float) -> str:
+    return repr(float(a)) if math.isfinite(a) else ""
 
 
 def write_json(path: str, value: Any) -> None:
@@ -143,6 +150,21 @@ def speed_and_sigma(v: Velocity) -> tuple[float, float]:
     speed = float(np.linalg.norm(v.v_B))
     along = v.v_B / speed if speed > 1e-9 else np.full(3, math.sqrt(1.0 / 3.0))
     return speed, math.sqrt(max(0.0, float(along @ v.cov @ along)))
+
+
+def describe_attitude(v: Velocity) -> str:
+    """Frame, up and age, for people, e.g. ``imu  up [+0.00 -1.00 +0.02] ± 0.4°  age 23.1 ms``."""
+    parts = [v.frame]
+    if math.isfinite(sigma := up_sigma(v)):
+        parts.append(f"up [{v.up_B[0]:+.2f} {v.up_B[1]:+.2f} {v.up_B[2]:+.2f}] ± {math.degrees(sigma):.1f}°")
+    if math.isfinite(v.age_ms):
+        parts.append(f"age {v.age_ms:.1f} ms")
+    return "  ".join(parts)
+
+
+def up_sigma(v: Velocity) -> float:
+    """Of the direction of up in B, where it is known worst, rad; NaN where up is not known."""
+    return math.sqrt(max(0.0, float(np.linalg.eigvalsh(v.up_cov)[-1]))) if np.isfinite(v.up_cov).all() else math.nan
 
 
 def with_progress(

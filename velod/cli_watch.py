@@ -12,7 +12,7 @@ import numpy as np
 
 from velod.cli_config import settings_of
 from velod.cli_exit import EXIT_FAILED
-from velod.cli_report import describe_velocity
+from velod.cli_report import describe_attitude, describe_velocity
 from velod.client import Listener, Received
 from velod.runtime.session import introducer_endpoint
 from velod.types import Health, Velocity
@@ -66,7 +66,7 @@ def describe(received: Received) -> str:
     """One line for one message: velocities in words, others field by field."""
     message = received.envelope.message
     if isinstance(message, Velocity):
-        return describe_velocity(message, latency_ms=origin_latency_ms(received))
+        return f"{describe_velocity(message, latency_ms=origin_latency_ms(received))}  {describe_attitude(message)}"
     shown = " ".join(f"{f.name}={_value(getattr(message, f.name))}" for f in fields(message))
     return f"{type(message).__name__} {shown}"
 

@@ -14,6 +14,7 @@ Frames: ``B`` body = IMU; ``C`` = the *rectified* left camera (x right, y down, 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from enum import StrEnum
 
@@ -173,6 +174,10 @@ class Velocity:
     reason: str  # why not tracking; "" while tracking
     batch_seq: int  # newest batch that went into it, -1: none
     batch_t_ns: int  # its end; t_ns - batch_t_ns was bridged by the IMU
+    age_ms: float = math.nan  # sensor time to publication; see ``velod.runtime.measure.SensorClock``
+    up_B: F64 = field(default_factory=lambda: np.full(3, np.nan))  # (3,) unit vector against gravity, frame B
+    up_cov: F64 = field(default_factory=lambda: np.full((3, 3), np.nan))  # (3, 3) of up_B, rad^2, rank 2
+    frame: str = "imu"  # what B is: "imu", "camera", or the name of a frame from the settings
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,6 +191,7 @@ class Odometry:
     q_OB: F64  # (4,) attitude, xyzw
     cov: F64  # (3, 3) covariance of p_OB, m^2
     distance_m: float  # way since the origin
+    age_ms: float = math.nan  # sensor time to publication
 
 
 @dataclass(frozen=True, slots=True)

@@ -167,6 +167,23 @@ def test_a_field_that_a_later_version_adds_is_ignored() -> None:
     assert isinstance(envelope.message, FlowBatch)
 
 
+def test_a_field_that_an_earlier_velod_did_not_send_has_its_default() -> None:
+    added = ("age_ms", "up_B", "up_cov", "frame")
+    sent = velocity(age_ms=3.0, up_B=np.ones(3), up_cov=np.eye(3), frame="camera")
+    message = decode(altered(sent, lambda m: [m.pop(name) for name in added])).message
+    assert isinstance(message, Velocity)
+    assert np.isnan(message.age_ms) and message.frame == "imu"
+    assert message.up_B.shape == (3,) and message.up_cov.shape == (3, 3)
+    assert np.isnan(message.up_B).all() and np.isnan(message.up_cov).all()
+
+
+def test_a_field_that_may_be_missing_is_checked_where_it_is_sent() -> None:
+    for name, value in (("up_B", b"12"), ("frame", 3), ("age_ms", "old")):
+        with pytest.raises(WireError) as caught:
+            decode(altered(velocity(), lambda m, name=name, value=value: m.update({name: value})))
+        assert caught.value.reason in ("wire.field_type", "wire.column_short")
+
+
 def test_the_origin_may_be_left_out() -> None:
     assert decode(altered(flow(), lambda m: m.pop("t_origin_ns"))).t_origin_ns == 0
 

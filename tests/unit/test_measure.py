@@ -1,11 +1,13 @@
-"""Latency percentiles and sequence gaps."""
+"""Latency percentiles, the age of data, and sequence gaps."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 import pytest
 
-from velod.runtime.measure import GapCounter, LatencyRing
+from velod.runtime.measure import GapCounter, LatencyRing, SensorClock
 
 
 def seen(window: int, *seqs: int) -> GapCounter:
@@ -74,3 +76,36 @@ def test_a_forgotten_stream_starts_anywhere_and_keeps_its_losses() -> None:
     for seq in range(10):
         gaps.see(seq)
     assert gaps.lost == before == 45
+
+
+MS, HOST_NS = 1_000_000, 1_700_000_000_000_000_000
+
+
+def listening(delays_ms: list[float], period_ms: int = 10) -> SensorClock:
+    """A clock that heard of one moment of the sensor every period, with these delays."""
+    clock = SensorClock()
+    for k, delay_ms in enumerate(delays_ms):
+        clock.heard(k * period_ms * MS, HOST_NS + k * period_ms * MS + round(delay_ms * MS))
+    return clock
+
+
+def test_an_age_counts_from_the_least_delay_that_was_seen() -> None:
+    clock = listening([7.0, 2.0, 9.0, 4.0])
+    # sensor time 30 ms arrived 4 ms late, of which 2 ms count as none
+    assert clock.age_ms(30 * MS, HOST_NS + 34 * MS) == pytest.approx(2.0, abs=0.01)
+    assert math.isnan(SensorClock().age_ms(0, HOST_NS))
+
+
+def test_a_slow_clock_of_the_sensor_does_not_make_ages_grow() -> None:
+    clock = SensorClock()
+    for k in range(100_000):  # 50 ppm over 1000 s
+        clock.heard(k * 10 * MS, HOST_NS + int(k * 10 * MS * (1 + 5e-5)) + 2 * MS)
+    assert clock.age_ms(k * 10 * MS, HOST_NS + int(k * 10 * MS * (1 + 5e-5)) + 5 * MS) == pytest.approx(3.0, abs=0.1)
+
+
+def test_a_sensor_clock_that_is_set_anew_is_followed_either_way() -> None:
+    for jump_ns in (-3600 * 10**9, 3600 * 10**9):
+        clock = listening([2.0] * 5)
+        t_ns = 4000 * 10**9 + jump_ns
+        clock.heard(t_ns, HOST_NS)
+        assert clock.age_ms(t_ns, HOST_NS + 3 * MS) == pytest.approx(3.0)

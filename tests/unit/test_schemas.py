@@ -56,6 +56,22 @@ def test_columns_are_little_endian_and_their_shapes_refer_to_known_sizes(name: s
             assert np.dtype(f.dtype).itemsize <= 8
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_a_field_that_may_be_missing_has_the_default_of_the_dataclass_and_stands_after_all_others(name: str) -> None:
+    of_class = {f.name: f for f in fields(MESSAGE_TYPES[name])}
+    s = schema(name)
+    assert [f.optional for f in s.fields] == sorted(f.optional for f in s.fields)
+    for f in s.fields:
+        if not f.optional:
+            continue
+        assert f.kind != "times"
+        default = of_class[f.name].default
+        if f.kind == "column":
+            default = of_class[f.name].default_factory()
+            assert default.shape == f.shape and default.dtype == f.dtype
+        np.testing.assert_array_equal(default, np.full_like(default, f.default) if f.kind == "column" else f.default)
+
+
 def test_every_schema_file_belongs_to_a_message_or_is_the_envelope() -> None:
     files = {p.name for p in (ROOT / "schemas").glob("*.json")}
     assert files == {f"{name}.v1.json" for name in [*MESSAGE_TYPES, "Envelope"]}

@@ -10,7 +10,8 @@ import numpy as np
 from velod.config import Settings
 from velod.geometry.calibration import Calibration
 from velod.geometry.rectify import rectify
-from velod.optimizer import flow_equation, inertial_residual
+from velod.optimizer import attitude, flow_equation, inertial_residual
+from velod.optimizer.attitude import Attitude
 from velod.optimizer.flow_equation import Fit, Measured, Rows
 from velod.optimizer.inertial import InertialMemory
 from velod.optimizer.preintegration import Preintegration, preintegrate
@@ -79,7 +80,8 @@ class Estimator:
         self.batches = 0  # that gave a velocity
         self.last_usable_t_ns = 0
         self._preintegrated_to = 0
-        self._carried: dict[int, tuple[F64, F64]] = {}  # t_ns -> prediction, from the head ``_carried_from``
+        # t_ns -> the IMU up to there and the prediction, from the head ``_carried_from``
+        self._carried: dict[int, tuple[Preintegration, F64, F64]] = {}
         self._carried_from: Head | None = None
 
     def add_imu(self, samples: ImuSamples) -> None:
@@ -114,22 +116,26 @@ class Estimator:
         head = self.head
         if head is None or not self.memory.covers(head.t_ns, t_ns):
             return None
+        _, v, cov = self._carry(head, t_ns)
+        return v.copy(), cov.copy()
+
+    def attitude(self, t_ns: int) -> Attitude | None:
+        """Which way is up at ``t_ns``, carried there from the head by the gyroscope; None while that is unknown."""
+        head = self.head
+        if head is None or not self.memory.covers(head.t_ns, t_ns):
+            return None
+        if head.gravity_direction_sigma > MAX_DIRECTION_SIGMA:
+            return None
+        return attitude.carry(self._carry(head, t_ns)[0], head.R_LB, head.g_L, head.cov[6:, 6:])
+
+    def _carry(self, head: Head, t_ns: int) -> tuple[Preintegration, F64, F64]:
         if self._carried_from is not head or len(self._carried) >= MAX_CARRIED:
             self._carried_from = head
             self._carried.clear()
         if t_ns not in self._carried:
             p = self._preintegrate(head.t_ns, t_ns, head.b_a, head.b_w)
-            self._carried[t_ns] = inertial_residual.carry(p, head.v_B, head.R_LB, head.g_L, head.cov)
-        v, cov = self._carried[t_ns]
-        return v.copy(), cov.copy()
-
-    def attitude(self, t_ns: int) -> tuple[F64, F64] | None:
-        """R_LB (3, 3) and gravity in B (3,), upwards, at ``t_ns``, carried there from the head by the gyroscope."""
-        head = self.head
-        if head is None or not self.memory.covers(head.t_ns, t_ns):
-            return None
-        R_LB = head.R_LB @ self._preintegrate(head.t_ns, t_ns, head.b_a, head.b_w).R_gamma
-        return R_LB, R_LB.T @ head.g_L
+            self._carried[t_ns] = (p, *inertial_residual.carry(p, head.v_B, head.R_LB, head.g_L, head.cov))
+        return self._carried[t_ns]
 
     def _biases(self) -> tuple[F64, F64]:
         return (np.zeros(3), np.zeros(3)) if self.head is None else (self.head.b_a, self.head.b_w)

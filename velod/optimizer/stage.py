@@ -7,12 +7,13 @@ stays away for longer than ``max_wait_ms`` of sensor time is a velocity made wit
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from velod.config import Settings
 from velod.geometry.calibration import Calibration
+from velod.optimizer.attitude import Attitude
 from velod.optimizer.dead_reckoning import DeadReckoning
 from velod.optimizer.estimator import Estimator
 from velod.types import NS_PER_S, DepthBatch, FlowBatch, ImuSamples, Odometry, TrackingState, Velocity
@@ -66,6 +67,7 @@ class OptimizerStage:
         self._forget_batches()
         self._imu_t_ns = -1  # newest sample
         self._event_t_ns = 0
+        self._now_ns = 0  # newest sensor time heard of
         self._tick = -1  # number of the next velocity on the grid of the output rate
         self._was_valid = False
         self._newest = (-1, 0)  # seq and t_ns of the newest batch taken in
@@ -81,6 +83,7 @@ class OptimizerStage:
             self._take_part(message)
         else:
             raise TypeError(f"the optimizer does not take {type(message).__name__}")
+        self._now_ns = max(self._now_ns, message.t_ns)
         return self._advance()
 
     def _count(self, name: str, by: int = 1) -> None:
@@ -173,8 +176,7 @@ class OptimizerStage:
                     break
                 self._count("velocity.without_batch")
                 self._take_out_of_order(tau)
-            velocity = self._velocity(tau)
-            out += [velocity, *self._reckon(velocity)]
+            out += self._put_out(tau)
             self._tick += 1
         return out
 
@@ -233,22 +235,28 @@ class OptimizerStage:
         if flow.t_ns > self._newest[1]:
             self._newest = (seq, flow.t_ns)
 
-    def _velocity(self, tau: int) -> Velocity:
+    def _put_out(self, tau: int) -> list[Velocity | Odometry]:
+        """The velocity at ``tau``; with its dead reckoning where it is valid."""
+        attitude = self._estimator.attitude(tau)
+        velocity = self._velocity(tau, attitude)
+        if not velocity.valid or attitude is None:
+            self._reckoning.stop()
+            return [velocity]
+        odometry = self._reckoning.update(tau, velocity.v_B, velocity.cov, attitude.R_LB, attitude.up_B)
+        return [velocity, replace(odometry, age_ms=velocity.age_ms)]
+
+    def _velocity(self, tau: int, attitude: Attitude | None) -> Velocity:
         predicted = self._estimator.predict(tau)
         if predicted is None:
             v, cov = np.zeros(3), np.eye(3) * UNKNOWN_SIGMA**2
         else:
             v, cov = predicted
         state, reason, valid = self._judge(tau, v, cov)
+        velocity = Velocity(
+            self._seq, tau, v, cov, valid, state, reason, *self._newest, age_ms=(self._now_ns - tau) * 1e-6
+        )
         self._seq += 1
-        return Velocity(self._seq - 1, tau, v, cov, valid, state, reason, *self._newest)
-
-    def _reckon(self, velocity: Velocity) -> list[Odometry]:
-        attitude = self._estimator.attitude(velocity.t_ns)
-        if not velocity.valid or attitude is None:
-            self._reckoning.stop()
-            return []
-        return [self._reckoning.update(velocity.t_ns, velocity.v_B, velocity.cov, *attitude)]
+        return velocity if attitude is None else replace(velocity, up_B=attitude.up_B, up_cov=attitude.up_cov)
 
     def _judge(self, tau: int, v: np.ndarray, cov: np.ndarray) -> tuple[str, str, bool]:
         """State, reason and validity of an estimate."""

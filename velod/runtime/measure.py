@@ -1,6 +1,8 @@
-"""What a process measures of itself: latency percentiles and holes in sequence numbers."""
+"""What a process measures of itself: latency percentiles, the age of data, and holes in sequence numbers."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 
@@ -28,6 +30,35 @@ class LatencyRing:
     def clear(self) -> None:
         """Begin a new period."""
         self._n = 0
+
+
+class SensorClock:
+    """Takes sensor time to host time, by the least delay with which data of the sensor arrives.
+
+    That least delay counts as none: what it hides is the way from the sensor to velod on an idle system. Host clocks
+    of several hosts must be synchronised.
+    """
+
+    _DRIFT = 1e-4
+    """The clocks may part this fast: crystals are good to 50 ppm each."""
+    _RESTART_NS = 10_000_000_000
+    """Data this late is not late: the sensor's clock was set anew."""
+
+    def __init__(self) -> None:
+        self._offset_ns: int | None = None  # host less sensor
+        self._t_ns = 0
+
+    def heard(self, t_ns: int, host_ns: int) -> None:
+        """Data of sensor time ``t_ns`` had arrived at ``host_ns``."""
+        offset_ns = host_ns - t_ns
+        if self._offset_ns is not None and offset_ns - self._offset_ns < self._RESTART_NS:
+            allowed_ns = self._offset_ns + int(max(0, t_ns - self._t_ns) * self._DRIFT)
+            offset_ns = min(offset_ns, allowed_ns)
+        self._offset_ns, self._t_ns = offset_ns, t_ns
+
+    def age_ms(self, t_ns: int, host_ns: int) -> float:
+        """How long before ``host_ns`` sensor time ``t_ns`` was; NaN before anything was heard."""
+        return math.nan if self._offset_ns is None else (host_ns - self._offset_ns - t_ns) * 1e-6
 
 
 class GapCounter:

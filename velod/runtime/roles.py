@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from typing import ClassVar
 
 import zenoh
@@ -12,6 +13,7 @@ import zenoh
 from velod.config import Settings
 from velod.runtime.dispatching import BatchDispatch
 from velod.runtime.inbox import Item
+from velod.runtime.measure import SensorClock
 from velod.runtime.shell import WorkerShell
 from velod.runtime.stages import Stage
 from velod.types import DepthBatch, Done, EventBatch, FlowBatch, ImuSamples, Message, Odometry, StereoBatch, Velocity
@@ -154,18 +156,23 @@ class OptimizerShell(WorkerShell):
         super().__init__(session, settings, stage_name, worker, stage)
         self._origin_ns: dict[tuple[int, int], int] = {}  # by seq and end of the batch
         self._newest = (-1, 0)
+        self._clock = SensorClock()
 
     def publish(self, outputs: Sequence[Message], cause: Envelope) -> None:
         """Velocities; the first one that uses a batch tells how long the batch took from end to end."""
         message = cause.message
+        if isinstance(message, ImuSamples):
+            self._clock.heard(max(message.t_ns, message.event_t_ns), cause.t_origin_ns)
         if isinstance(message, FlowBatch | DepthBatch):
             self._origin_ns[message.seq, message.t_ns] = cause.t_origin_ns
             if len(self._origin_ns) > self._REMEMBERED:
                 del self._origin_ns[next(iter(self._origin_ns))]
         for output in outputs:
+            if not isinstance(output, Velocity | Odometry):
+                continue
+            output = replace(output, age_ms=self._clock.age_ms(output.t_ns, time.time_ns()))
             if isinstance(output, Odometry):
                 self.outlet.publish(ODOMETRY, output)
-            if not isinstance(output, Velocity):
                 continue
             batch = (output.batch_seq, output.batch_t_ns)
             t_origin_ns = self._origin_ns.get(batch, 0)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -63,15 +64,14 @@ def decode(data: bytes | bytearray | memoryview, expect: type[Any] | None = None
     tree = _unpack(data)
     s = _schema_of(tree, expect)
     sizes = _sizes(s, tree)
-    values = {f.name: _READ[f.kind](s, f, tree, sizes) for f in s.fields}
+    values = {f.name: _value(s, f, tree, sizes) for f in s.fields}
     for f in s.fields:
         if f.kind == "column":
             _check_column(s, f, values)
         elif f.not_after and values[f.name] > values[f.not_after]:
             raise WireError("wire.time_backwards", f"{s.name}: {f.name} is after {f.not_after}")
     head = schema("Envelope")
-    tree.setdefault("t_origin_ns", 0)
-    times = {f.name: _read_int(s, f, tree, sizes) for f in head.fields if f.name.startswith("t_")}
+    times = {f.name: _value(s, f, tree, sizes) for f in head.fields if f.name.startswith("t_")}
     message = MESSAGE_TYPES[s.name.removeprefix("velod.")](**values)
     return Envelope(message=message, **times)
 
@@ -119,7 +119,7 @@ def _sizes(s: Schema, tree: dict[str, Any]) -> dict[str, int]:
     for dim in s.dims.values():
         sizes[dim.name] = _sent_size(s, dim.name, tree) if dim.sent else 0
     for f in s.fields:
-        if f.shape and isinstance(f.shape[0], str) and not s.dims[f.shape[0]].sent:
+        if f.shape and isinstance(f.shape[0], str) and not s.dims[f.shape[0]].sent and _sent(f, tree):
             row = _row_bytes(f)
             sizes[f.shape[0]] = max(sizes[f.shape[0]], -(-len(_bin(s, f, tree)) // row))
     for dim in s.dims.values():
@@ -157,6 +157,20 @@ def _get(s: Schema, name: str, tree: dict[str, Any]) -> Any:
 
 
 # --- reading ---
+
+
+def _sent(f: Field, tree: dict[str, Any]) -> bool:
+    """False for a field that the sender's velod did not know yet; one that it must have sent is missed on reading."""
+    return not f.optional or f.name in tree
+
+
+def _value(s: Schema, f: Field, tree: dict[str, Any], sizes: dict[str, int]) -> Any:
+    """What was sent, or the default of what was not."""
+    if _sent(f, tree):
+        return _READ[f.kind](s, f, tree, sizes)
+    if f.kind != "column":
+        return copy(f.default)
+    return np.full([part if isinstance(part, int) else sizes[part] for part in f.shape], f.default, f.dtype)
 
 
 def _read_int(s: Schema, f: Field, tree: dict[str, Any], sizes: dict[str, int]) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.resources import files
@@ -55,6 +56,8 @@ class Field:
     not_after: str = ""  # name of the int field that the value does not exceed
     order: str = ""  # "increasing"
     finite: bool | str = False  # True, or the name of the bool field that demands it
+    optional: bool = False  # came after the first messages of this version: may be missing ...
+    default: Any = None  # ... and is then this; of every element of a column
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,4 +88,8 @@ def _field(tree: dict[str, Any]) -> Field:
         known[key] = tuple(known.get(key, ()))
     if "dtype" in known:
         known["dtype"] = np.dtype(known["dtype"])
+    if "default" in known:
+        known["optional"] = True
+        if known["default"] is None:
+            known["default"] = math.nan  # which JSON cannot say
     return Field(**known)
