@@ -23,3 +23,14 @@ def simulated(pytestconfig: pytest.Config) -> Callable[[str, float], Path]:
             return simulated_recording(name, seconds, seed=1)
 
     return make
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--long", action="store_true", help="run the tests marked long, too")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if not config.getoption("--long"):
+        for item in items:
+            if "long" in item.keywords:
+                item.add_marker(pytest.mark.skip(reason="long: runs with --long only"))

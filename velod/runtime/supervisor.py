@@ -84,6 +84,7 @@ class Supervisor:
         self._stack = ExitStack()
         self._slots: dict[str, _Slot] = {}
         self._spare: ChildProcess | None = None
+        self._spare_is_known = False  # to be ready: said once
         self._alive: set[tuple[str, str]] = set()
         self._alive_lock = Lock()
         self._name = f"supervisor-{socket.gethostname().split('.')[0]}" if settings.zenoh.connect else "supervisor"
@@ -251,7 +252,10 @@ class Supervisor:
             self._spare, self._wants_spare = None, False
         elif self._spare is None and self.is_up(self._stages):
             command = [*self._command("velod.runtime.spare", ""), "--stages", ",".join(self._stages)]
-            self._spare = ChildProcess(command, self._on_line)
+            self._spare, self._spare_is_known = ChildProcess(command, self._on_line), False
+        elif self.spare_is_ready and not self._spare_is_known:
+            self._spare_is_known = True
+            log.info("the spare is ready")
 
     def _counters(self) -> dict[str, int]:
         return {f"restarts.{s.worker}": s.restarts for s in self._slots.values() if s.restarts}
