@@ -27,7 +27,10 @@ EVAL_KEYS = [
     *("ave_mps", "rve_percent", "p95_mps", "n", "first_valid_s", "valid_fraction", "ave_floor_mps", "nees_mean"),
     *("drift_percent", "real_time_factor", "latency_p50_ms", "latency_p99_ms"),
 ]
-CSV_HEADER = "t_ns,vx,vy,vz,cov_xx,cov_xy,cov_xz,cov_yy,cov_yz,cov_zz,state,valid,age_ms"
+CSV_HEADER = (
+    "t_ns,vx,vy,vz,cov_xx,cov_xy,cov_xz,cov_yy,cov_yz,cov_zz,state,valid,age_ms,"
+    "bridged_ms,up_x,up_y,up_z,up_sigma,frame"
+)
 
 
 @pytest.fixture(scope="module")
@@ -217,6 +220,9 @@ def test_replay_writes_every_velocity_as_csv(
     assert np.abs(v[inside] - truth_at(truth, t_ns[inside])).mean() < 0.3
     assert {row["state"] for row in valid} <= {"tracking", "degraded"}
     assert all(0.0 <= float(row["age_ms"]) < 100.0 for row in valid)
+    assert all(0.0 <= float(row["bridged_ms"]) < 100.0 for row in valid)
+    up = np.array([[float(row[c] or "nan") for c in ("up_x", "up_y", "up_z")] for row in valid])
+    assert np.allclose(np.linalg.norm(up[-10:], axis=1), 1.0) and {row["frame"] for row in valid} == {"imu"}
     assert all(float(row["cov_xx"]) > 0.0 for row in valid)
     shown = capsys.readouterr().out
     assert re.search(r"AVE +0\.\d{4} m/s", shown) and "75.00 Hz" in shown
