@@ -13,16 +13,18 @@ from velod import __version__
 from velod.cli_config import calibration_of, settings_of
 from velod.cli_exit import RunFailed
 from velod.cli_report import Line, progress_bar, write_json
+from velod.cli_stages import stages_of, true_depth_of
 from velod.config import Settings
 from velod.eval.baselines import benosman_settings, integrate_imu, paper_settings
 from velod.eval.compare import Case, compare, judge
-from velod.eval.floor import TrueDepth, has_floor, with_perfect_flow_and_depth
+from velod.eval.floor import with_perfect_flow_and_depth
 from velod.eval.front_end import FrontEnd, SecondFlow, estimate
 from velod.eval.metrics import evaluate
 from velod.eval.report import Report, StageTimes
-from velod.eval.stage_errors import StageErrors, StageTruthError, stage_errors
-from velod.eval.table import Row, as_json, ave_table, detail_table, notes, rve_table, stage_table, text_table
-from velod.io import Imu, Recording, open_recording, read_depth
+from velod.eval.stage_errors import StageErrors
+from velod.eval.stage_tables import group_tables, overview_tables
+from velod.eval.table import Row, as_json, ave_table, detail_table, notes, rve_table, text_table
+from velod.io import Imu, Recording, open_recording
 from velod.types import DepthBatch, EventBatch, EventPacket, FlowBatch, ImuPacket, Message, StereoBatch
 
 _EVENT_SEED = 1
@@ -68,7 +70,7 @@ def compare_files(
             raise ValueError(f"{file}: holds no truth to judge against")
         case, times = _run(settings, recording, recording.path.stem, [recording.imu], progress)
         judgement = compare(case, settings, progress.say)
-        row = Row(case.name, recording.duration_s, judgement, stages=_stage_errors(recording, case))
+        row = Row(case.name, recording.duration_s, judgement, stages=_stage_errors(settings, recording, case))
         page.add(row, case, recording.left, times)
         rows.append(row)
         progress.next()
@@ -78,13 +80,13 @@ def compare_files(
 
 def floor_mps(settings: Settings, recording: Recording) -> float | None:
     """AVE of the back end on perfect flow and depth, m/s; None unless the recording is a simulated one."""
-    true_depth = _true_depth_of(recording)
+    true_depth = true_depth_of(recording)
     if true_depth is None or recording.truth is None:
         return None
-    from velod.runtime.offline import run_offline
+    from velod.runtime.offline import run_front_end
 
     front_end = FrontEnd()
-    run_offline(settings, recording.calibration, recording.packets(), front_end.note)
+    run_front_end(settings, recording.calibration, recording.packets(), front_end.note)
     perfect = with_perfect_flow_and_depth(front_end, recording.calibration, recording.truth, true_depth)
     velocities = estimate(perfect, settings, recording.calibration)
     return evaluate(velocities, recording.truth, recording.t_start_ns).ave_mps
@@ -110,7 +112,7 @@ def _simulated_row(
     progress.say(f"{name}: IMU alone over {imu_seconds:g} s")
     truth = true_motion(recipe.trajectory, imu_seconds)
     long = tuple(judge(integrate_imu(imu, truth, settings), imu, truth, 0) for imu in imus(imu_seconds))
-    row = Row(name, seconds, judgement, imu_seconds, long, _stage_errors(recording, case))
+    row = Row(name, seconds, judgement, imu_seconds, long, _stage_errors(settings, recording, case))
     if page is not None:
         page.add(row, case, recording.left, times)
     return row
@@ -144,30 +146,14 @@ def _run(
     run_offline(paper, calibration, packets, like_paper.note)
     case = Case(
         name, calibration, recording.truth, recording.t_start_ns, imus,
-        own, benosman.in_place_of(own), like_paper, _true_depth_of(recording),
+        own, benosman.in_place_of(own), like_paper, true_depth_of(recording),
     )  # fmt: skip
-    return case, clock.per_batch(len(own.events), back_end_s)
+    return case, clock.per_batch(len(own.selected), back_end_s)
 
 
-def _stage_errors(recording: Recording, case: Case) -> StageErrors | None:
-    """Of velod's front end; None without depth images, or with a rig that they do not fit."""
-    depth = read_depth(recording.path) if recording.path.is_file() else None
-    if depth is None:
-        return None
-    try:
-        return stage_errors(case.calibration, case.truth, depth, case.own.flows, case.own.depths)
-    except StageTruthError:
-        return None
-
-
-def _true_depth_of(recording: Recording) -> TrueDepth | None:
-    """The simulator's, where it knows the recording and the cameras are such that it can say."""
-    from velod.sim.true_depth import recipe_of, true_depth
-
-    if recording.truth is None or not recording.path.is_file() or not has_floor(recording.calibration):
-        return None
-    recipe = recipe_of(recording.truth, read_depth(recording.path))
-    return None if recipe is None else lambda t_ns, x, y: true_depth(recipe, t_ns, x, y)
+def _stage_errors(settings: Settings, recording: Recording, case: Case) -> StageErrors | None:
+    """Of velod's front end; None where the truth of it is not known."""
+    return None if case.true_depth is None else stages_of(settings, recording, case.own, case.true_depth)
 
 
 def _finish(rows: Sequence[Row], seeds: Sequence[int], json: str | None, page: Report | None) -> int:
@@ -175,7 +161,7 @@ def _finish(rows: Sequence[Row], seeds: Sequence[int], json: str | None, page: R
         "AVE, m/s": ave_table(rows),
         "RVE (Eq. 16), %": rve_table(rows),
         "velod's own estimate, and dead reckoning": detail_table(rows),
-        "Normal flow and disparity against the simulator's truth": stage_table(rows),
+        **overview_tables({row.name: row.stages for row in rows}),
     }
     text = "\n\n".join(f"{title}\n{text_table(lines)}" for title, lines in tables.items())
     # With --json - the table must not get into the JSON.
@@ -183,6 +169,7 @@ def _finish(rows: Sequence[Row], seeds: Sequence[int], json: str | None, page: R
     if json is not None:
         write_json(json, {"velod": __version__, **as_json(rows, seeds)})
     if page is not None:
+        tables |= group_tables({row.name: row.stages for row in rows})
         print(f"wrote {page.finish(tables, notes(rows, seeds))}", file=sys.stderr)
     failed = [row.name for row in rows if not all(j.ever_valid for j in row.judgement["velod"])]
     if failed:

@@ -9,50 +9,47 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from velod.cli_stages import true_depth_of
 from velod.config import Settings
+from velod.eval.front_end import FrontEnd
 from velod.eval.metrics import Metrics, evaluate
-from velod.eval.stage_errors import StageErrors, StageTruthError, stage_errors
+from velod.eval.scene_truth import TrueDepth
+from velod.eval.stage_errors import StageErrors, stage_errors
 from velod.geometry.calibration import Calibration
-from velod.io import Recording, open_recording, read_depth
+from velod.io import Recording, open_recording
 from velod.runtime.offline import run_offline
-from velod.types import DepthBatch, FlowBatch, Message
+from velod.types import DepthBatch, EventBatch, FlowBatch
 
 SEQUENCES = {"corridor-1": 0.6, "boxes-4": 0.6}
 
 
 @dataclass(frozen=True)
 class Run:
-    path: Path
     recording: Recording
     metrics: Metrics
+    selected: list[EventBatch]
     flows: list[FlowBatch]
     depths: list[DepthBatch]
+    true_depth: TrueDepth
 
     def stage_errors(self, calibration: Calibration | None = None) -> StageErrors:
-        depth = read_depth(self.path)
-        assert depth is not None
         assert self.recording.truth is not None
         return stage_errors(
-            calibration or self.recording.calibration, self.recording.truth, depth, self.flows, self.depths
-        )
+            calibration or self.recording.calibration, self.recording.truth, self.true_depth, Settings().depth,
+            self.selected, self.flows, self.depths,
+        )  # fmt: skip
 
 
 @pytest.fixture(scope="module", params=SEQUENCES)
 def run(request: pytest.FixtureRequest, simulated: Callable[[str, float], Path]) -> Run:
     path = simulated(request.param, SEQUENCES[request.param])
     recording = open_recording(path)
-    flows: list[FlowBatch] = []
-    depths: list[DepthBatch] = []
-
-    def keep(message: Message) -> None:
-        if isinstance(message, FlowBatch):
-            flows.append(message)
-        elif isinstance(message, DepthBatch):
-            depths.append(message)
-
-    velocities = run_offline(Settings(), recording.calibration, recording.packets(), keep)
-    assert recording.truth is not None
-    return Run(path, recording, evaluate(velocities, recording.truth, recording.t_start_ns), flows, depths)
+    kept = FrontEnd()
+    velocities = run_offline(Settings(), recording.calibration, recording.packets(), kept.note)
+    true_depth = true_depth_of(recording)
+    assert recording.truth is not None and true_depth is not None
+    metrics = evaluate(velocities, recording.truth, recording.t_start_ns)
+    return Run(recording, metrics, kept.selected, kept.flows, kept.depths, true_depth)
 
 
 def test_the_velocity_is_right_without_any_truth_given(run: Run) -> None:
@@ -69,35 +66,48 @@ def test_the_covariance_is_no_idle_claim(run: Run) -> None:
 
 
 def test_normal_flow_is_right_and_its_sigma_honest(run: Run) -> None:
-    errors = run.stage_errors()
-    assert errors.flows > 500
-    assert abs(errors.flow_bias) < 0.01
-    assert errors.flow_spread < 0.045
-    assert errors.flow_outliers < 0.01
-    assert 0.4 < errors.flow_sigmas < 1.6
+    errors = run.stage_errors().flow
+    assert errors.n > 5000
+    assert abs(errors.bias) < 0.01
+    assert errors.spread < 0.045
+    assert errors.outliers < 0.01
+    assert 0.4 < errors.sigmas < 1.6
 
 
 def test_disparity_is_right_and_its_sigma_honest(run: Run) -> None:
     errors = run.stage_errors()
-    assert errors.disparities > 500
-    assert abs(errors.disparity_bias_px) < 0.04
-    assert errors.disparity_mad_px < 0.12
-    assert errors.disparity_wrong < 0.02
-    assert 0.5 < errors.disparity_sigmas < 1.6
+    assert errors.depth.n > 5000
+    assert abs(errors.depth.bias_px) < 0.04
+    assert errors.depth.mad_px < 0.12
+    assert errors.depth.wrong < 0.02
+    assert 0.5 < errors.depth.sigmas < 1.6
+    assert errors.refined_depth.mad_px < errors.block_depth.mad_px
 
 
 def test_the_judge_of_the_stages_sees_a_wrong_baseline_and_a_shifted_disparity(run: Run) -> None:
     calibration = run.recording.calibration
     wider = replace(calibration, t_RL=1.05 * calibration.t_RL)
-    assert run.stage_errors(wider).disparity_bias_px < -0.25
+    assert run.stage_errors(wider).depth.bias_px < -0.25
     shifted = [replace(batch, disparity=batch.disparity + np.float32(0.5)) for batch in run.depths]
-    assert replace(run, depths=shifted).stage_errors().disparity_bias_px == pytest.approx(0.5, abs=0.04)
+    assert replace(run, depths=shifted).stage_errors().depth.bias_px == pytest.approx(0.5, abs=0.04)
     faster = [replace(batch, speed=1.1 * batch.speed) for batch in run.flows]
-    assert replace(run, flows=faster).stage_errors().flow_bias == pytest.approx(0.1, abs=0.012)
+    assert replace(run, flows=faster).stage_errors().flow.bias == pytest.approx(0.1, abs=0.012)
 
 
-def test_stages_are_not_judged_where_the_depth_images_do_not_fit(run: Run) -> None:
-    calibration = run.recording.calibration
-    lens = replace(calibration.left, model="equi", dist=(0.1, 0.0, 0.0, 0.0))
-    with pytest.raises(StageTruthError, match="undistorted"):
-        run.stage_errors(replace(calibration, left=lens, right=lens))
+def test_groups_hold_every_event_once(run: Run) -> None:
+    errors = run.stage_errors()
+    for what in ("distance", "polarity"):
+        assert sum(group.flow.n for group in errors.groups[what]) == errors.flow.n, what
+        assert sum(group.depth.n for group in errors.groups[what]) == errors.depth.n, what
+    assert sum(group.flow.n for group in errors.groups["flow"]) == errors.flow.n
+    assert sum(group.flow.n for group in errors.groups["edge direction, |n_x|"]) == errors.flow.n
+
+
+def test_a_depth_that_is_missing_lowers_the_share_of_events_with_a_depth(run: Run) -> None:
+    errors = run.stage_errors()
+    assert errors.with_depth < errors.with_depth_where_possible < 1.0
+    halved = [
+        replace(b, **{c: getattr(b, c)[::2] for c in ("index", "disparity", "inv_depth", "sigma", "refined")})
+        for b in run.depths
+    ]
+    assert replace(run, depths=halved).stage_errors().with_depth == pytest.approx(errors.with_depth / 2, rel=0.02)

@@ -89,6 +89,8 @@ def test_a_recording_without_truth_cannot_be_compared(capsys: pytest.CaptureFixt
         ([], "Give recordings, or --table synthetic"),
         (["--quick"], "--quick goes with --table"),
         (["a.h5", "--table", "synthetic"], "not both"),
+        (["--stages", "--table", "synthetic"], "--stages goes with recordings"),
+        (["a.h5", "--stages", "--report", "page"], "--stages goes with recordings"),
     ],
 )
 def test_what_cannot_be_meant_is_refused(

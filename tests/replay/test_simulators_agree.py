@@ -2,45 +2,53 @@
 
 from __future__ import annotations
 
+import json
+import math
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from velod.config import Settings
-from velod.eval.stage_errors import StageErrors, stage_errors
-from velod.io import open_recording, read_depth
-from velod.runtime.offline import run_offline
-from velod.types import DepthBatch, FlowBatch, Message
+from velod.cli import main
 
 ESIM = Path(__file__).parents[3] / "shared" / "data" / "boxes_esim.h5"
 
 
-def errors_on(path: Path) -> StageErrors:
-    recording, depth = open_recording(path), read_depth(path)
-    assert recording.truth is not None
-    assert depth is not None
-    flows: list[FlowBatch] = []
-    depths: list[DepthBatch] = []
-
-    def keep(message: Message) -> None:
-        if isinstance(message, FlowBatch):
-            flows.append(message)
-        elif isinstance(message, DepthBatch):
-            depths.append(message)
-
-    run_offline(Settings(), recording.calibration, recording.packets(), keep)
-    return stage_errors(recording.calibration, recording.truth, depth, flows, depths)
-
-
-def test_stage_errors_on_esim_events_are_ours_within_a_factor_of_1_5(
-    simulated: Callable[[str, float], Path],
-) -> None:
+@pytest.fixture(scope="module")
+def errors(simulated: Callable[[str, float], Path], tmp_path_factory: pytest.TempPathFactory) -> list[Any]:
+    """What ``velod eval --stages --json`` says of their events, and of ours."""
     if not ESIM.exists():
         pytest.skip("../shared/data/boxes_esim.h5 is not here")
-    theirs, ours = errors_on(ESIM), errors_on(simulated("boxes-4", 0.6))
-    for name in ("flow_spread", "flow_sigmas", "disparity_mad_px", "disparity_sigmas"):
-        assert 1 / 1.5 < getattr(theirs, name) / getattr(ours, name) < 1.5, name
-    # Medians near zero have no ratio worth the name.
-    assert abs(theirs.flow_bias - ours.flow_bias) < 0.01
-    assert abs(theirs.disparity_bias_px - ours.disparity_bias_px) < 0.03
+    out = tmp_path_factory.mktemp("stages") / "out.json"
+    assert main(["eval", str(ESIM), str(simulated("boxes-4", 0.6)), "--stages", "--json", str(out)]) == 0
+    found: list[Any] = json.loads(out.read_text())
+    return found
+
+
+def test_stage_errors_on_esim_events_are_ours_within_a_factor_of_1_5(errors: list[Any]) -> None:
+    theirs, ours = errors
+    for part, name in (
+        *(("flow", "spread"), ("flow", "sigmas")),
+        *(("depth", "mad_px"), ("depth", "sigmas"), ("refined_depth", "mad_px"), ("depth", "z_spread")),
+    ):
+        assert 1 / 1.5 < theirs[part][name] / ours[part][name] < 1.5, (part, name)
+
+
+def test_biases_on_esim_events_differ_from_ours_by_no_more_than_chance_and_a_tenth_of_the_spread(
+    errors: list[Any],
+) -> None:
+    """Medians near zero have no ratio worth the name."""
+    theirs, ours = errors
+    for part, bias, error, spread in (
+        ("flow", "bias", "bias_se", "spread"),
+        ("refined_depth", "bias_px", "bias_se_px", "mad_px"),
+    ):
+        chance = 3.0 * math.hypot(theirs[part][error], ours[part][error])
+        assert abs(theirs[part][bias] - ours[part][bias]) < chance + 0.1 * ours[part][spread], part
+
+
+def test_depth_images_carried_to_the_events_tell_of_most_of_them(errors: list[Any]) -> None:
+    theirs, ours = errors
+    assert "depth images" in theirs["how"] and "ray casting" in ours["how"]
+    assert theirs["judged"] > 0.75 and ours["judged"] > 0.75

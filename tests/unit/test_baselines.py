@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ import pytest
 from velod.config import Settings, from_tree, to_tree
 from velod.eval.baselines import benosman_settings, integrate_imu, paper_settings, solve_linear
 from velod.eval.dead_reckoning import attitude_at, dead_reckoning
-from velod.eval.floor import FloorError, with_perfect_flow_and_depth
+from velod.eval.floor import with_perfect_flow_and_depth
 from velod.eval.front_end import FrontEnd, SecondFlow, joined
 from velod.eval.metrics import evaluate, truth_at
 from velod.geometry.camera import motion_field_rows
@@ -198,11 +198,22 @@ def test_the_papers_settings_are_allowed_and_differ_from_ours_where_the_paper_do
 # --- the floor ---
 
 
+@dataclass(frozen=True)
+class KnownDepth:
+    """The same depths whatever is asked."""
+
+    z: np.ndarray
+    how: str = "known"
+
+    def __call__(self, t_ns: np.ndarray, rays: np.ndarray, shift_m: float = 0.0) -> np.ndarray:
+        return np.broadcast_to(self.z[:, None], rays.shape[:2]).astype(np.float64)
+
+
 def test_perfect_flow_and_depth_are_the_simulators_at_the_measured_positions_and_directions() -> None:
     wrong_flow, wrong_depth = batch(0, v=np.array([9.0, 9.0, 9.0]))
     flow, depth = batch(0)
     perfect = with_perfect_flow_and_depth(
-        front_end(wrong_flow, wrong_depth), CALIBRATION, TRUTH, lambda t_ns, x, y: 1.0 / depth.inv_depth
+        front_end(wrong_flow, wrong_depth), CALIBRATION, TRUTH, KnownDepth(1.0 / depth.inv_depth)
     )
     got_flow, got_depth = perfect.flows[0], perfect.depths[0]
     np.testing.assert_allclose(got_flow.n * got_flow.speed[:, None], flow.n * flow.speed[:, None], atol=0.01)
@@ -211,10 +222,13 @@ def test_perfect_flow_and_depth_are_the_simulators_at_the_measured_positions_and
     np.testing.assert_array_equal(got_flow.x, wrong_flow.x)
 
 
-def test_there_is_no_floor_for_a_distorted_camera() -> None:
-    lens = replace(CALIBRATION.left, model="equi", dist=(0.1, 0.0, 0.0, 0.0))
-    with pytest.raises(FloorError, match="undistorted"):
-        with_perfect_flow_and_depth(front_end(), replace(CALIBRATION, left=lens), TRUTH, lambda t_ns, x, y: x)
+def test_events_whose_true_depth_is_not_known_have_no_part_in_the_floor() -> None:
+    flow, depth = batch(0)
+    z = 1.0 / depth.inv_depth
+    z[:3] = np.nan
+    perfect = with_perfect_flow_and_depth(front_end(flow, depth), CALIBRATION, TRUTH, KnownDepth(z))
+    np.testing.assert_array_equal(perfect.flows[0].index, flow.index[3:])
+    np.testing.assert_array_equal(perfect.depths[0].index, flow.index[3:])
 
 
 # --- dead reckoning ---

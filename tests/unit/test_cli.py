@@ -113,6 +113,7 @@ def test_a_recording_without_truth_cannot_be_judged(
     with h5py.File(path, "a") as f:
         del f["gt"]
     assert "holds no truth" in error_of(capsys, "eval", str(path), "--offline")
+    assert "holds no truth" in error_of(capsys, "eval", str(path), "--stages")
 
 
 def test_a_recording_without_a_calibration_asks_for_one_and_takes_the_one_that_is_named(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,8 +12,9 @@ import pytest
 from velod.eval.compare import METHODS, Judged, Judgement, judge
 from velod.eval.metrics import evaluate
 from velod.eval.paper import PAPER, TABLE_IV_MS
-from velod.eval.stage_errors import StageErrors
-from velod.eval.table import Row, as_json, ave_table, detail_table, notes, rve_table, spread, stage_table, text_table
+from velod.eval.stage_errors import DepthErrors, FlowErrors, Group, StageErrors
+from velod.eval.stage_tables import group_tables, overview_tables
+from velod.eval.table import Row, as_json, ave_table, detail_table, notes, rve_table, spread, text_table
 from velod.io.model import Imu, Truth
 from velod.types import Velocity
 
@@ -140,14 +142,34 @@ def test_judging_agrees_with_the_metrics_of_velod_eval() -> None:
     assert judge(velocities, IMU, TRUTH, 0).metrics == evaluate(velocities, TRUTH, 0)
 
 
+def stages(**changes: object) -> StageErrors:
+    flow = FlowErrors(1000, -0.002, 0.0004, 0.03, 0.001, 0.9, 1.1, 0.02)
+    depth = DepthErrors(800, 0.0031, 0.001, 0.04, 0.02, -0.001, 0.012, math.nan, 0.95, 0.005)
+    groups = {"polarity": [Group("ON", flow, depth), Group("OFF", replace(flow, n=0, bias=math.nan), depth)]}
+    known = StageErrors("casting", 2000, 0.9, 0.1, 0.99, 0.8, 0.88, 0.75, flow, depth, depth, depth, groups)
+    return replace(known, **changes)  # type: ignore[arg-type]
+
+
 def test_stage_errors_are_shown_in_percent_and_pixels_and_a_dash_where_there_is_no_truth() -> None:
-    errors = StageErrors(1000, -0.002, 0.03, 0.001, 0.9, 800, 0.0031, 0.04, 0.02, math.nan)
+    shares, flow, depth = overview_tables({"a": stages(), "b": None}).values()
+    assert shares[1] == ["a", "2000", "90.0", "10.0", "99.0", "80.0", "88.0", "75.0"]
+    assert flow[1] == ["a", "1000", "-0.20", "0.04", "3.00", "0.10", "0.90", "1.10", "2.00"]
+    assert [line[1] for line in depth[1:4]] == ["all", "refined", "block"]
+    assert depth[1][2:] == ["800", "0.003", "0.001", "0.040", "2.00", "-0.10", "1.20", "-", "0.95", "0.50"]
+    assert all(set(table[-1][1:]) == {"-"} for table in (shares, flow, depth))
+
+
+def test_groups_of_events_have_a_line_each() -> None:
+    flow, depth = group_tables({"a": stages(), "b": None}).values()
+    assert [line[:3] for line in flow[1:]] == [["a", "ON", "1000"], ["a", "OFF", "0"]]
+    assert flow[2][3] == "-"
+    assert len(depth) == 3
+
+
+def test_stage_errors_of_the_json_have_the_names_of_the_fields_and_null_for_the_unknown() -> None:
     one = {"velod": [judged(0.1)]}
-    rows = [Row("a", 1.0, one, stages=errors), Row("b", 1.0, one)]
-    table = stage_table(rows)
-    assert table[1] == ["a", "1000", "-0.20", "3.00", "0.10", "0.90", "800", "0.003", "0.040", "2.00", "nan"]
-    assert set(table[2][1:]) == {"-"}
-    first, second = as_json(rows, [])["sequences"]
-    assert first["stages"]["flow_bias"] == -0.002
-    assert first["stages"]["disparity_sigmas"] is None
+    first, second = as_json([Row("a", 1.0, one, stages=stages()), Row("b", 1.0, one)], [])["sequences"]
+    assert first["stages"]["flow"]["bias"] == -0.002
+    assert first["stages"]["depth"]["sigmas"] is None
+    assert first["stages"]["groups"]["polarity"][1]["label"] == "OFF"
     assert second["stages"] is None

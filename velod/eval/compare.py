@@ -10,9 +10,10 @@ import numpy as np
 from velod.config import Settings
 from velod.eval.baselines import integrate_imu, paper_settings, solve_linear
 from velod.eval.dead_reckoning import Track, dead_reckoning
-from velod.eval.floor import TrueDepth, with_perfect_flow_and_depth
+from velod.eval.floor import with_perfect_flow_and_depth
 from velod.eval.front_end import FrontEnd, estimate
 from velod.eval.metrics import MIN_SPEED_MPS, Metrics, evaluate, truth_at
+from velod.eval.scene_truth import TrueDepth
 from velod.geometry.calibration import Calibration
 from velod.io.model import Imu, Truth
 from velod.types import F64, I64, Velocity

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from velod.config import Settings
 from velod.flow.stage import FlowStage
@@ -17,24 +18,24 @@ from velod.geometry.calibration import Calibration
 from velod.io.model import Imu
 from velod.optimizer.flow_equation import pairs
 from velod.optimizer.stage import OptimizerStage
-from velod.types import I64, DepthBatch, EventBatch, FlowBatch, ImuSamples, Message, Velocity
+from velod.types import I64, PATCH, DepthBatch, EventBatch, FlowBatch, ImuSamples, Message, Velocity
+
+_NO_PATCH = np.empty((0, PATCH * PATCH), np.uint32)
 
 
 @dataclass(frozen=True, slots=True)
 class FrontEnd:
-    """The messages to the optimizer in the order in which they came, and how many events led to them."""
+    """The messages to the optimizer in the order in which they came, and the events that they speak of."""
 
     messages: list[FlowBatch | DepthBatch | ImuSamples] = field(default_factory=list)
-    selected: list[int] = field(default_factory=list)  # events selected, by batch
-    events: list[int] = field(default_factory=list)  # left events, by batch
+    selected: list[EventBatch] = field(default_factory=list)  # without their patches
 
     def note(self, message: Message) -> None:
         """Keep a message; for ``run_offline(on_message=...)``."""
         if isinstance(message, FlowBatch | DepthBatch | ImuSamples):
             self.messages.append(message)
         elif isinstance(message, EventBatch):
-            self.selected.append(len(message.x))
-            self.events.append(message.n_events)
+            self.selected.append(replace(message, patch=_NO_PATCH))
 
     @property
     def flows(self) -> list[FlowBatch]:
@@ -98,7 +99,13 @@ def estimate(front_end: FrontEnd, settings: Settings, calibration: Calibration) 
 
 def joined(flow: FlowBatch, depth: DepthBatch) -> tuple[FlowBatch, DepthBatch]:
     """The events that both batches speak of."""
-    at_flow, at_depth = pairs(flow.index, depth.index)
+    return taken(flow, depth, *pairs(flow.index, depth.index))
+
+
+def taken(
+    flow: FlowBatch, depth: DepthBatch, at_flow: NDArray[np.integer], at_depth: NDArray[np.integer]
+) -> tuple[FlowBatch, DepthBatch]:
+    """These rows of both."""
     flow_columns = {name: getattr(flow, name)[at_flow] for name in ("index", "age", "x", "y", "n", "speed", "sigma")}
     depth_columns = {
         name: getattr(depth, name)[at_depth] for name in ("index", "disparity", "inv_depth", "sigma", "refined")

@@ -130,7 +130,7 @@ def _motion(row: Row, case: Case) -> list[str]:
     speed, rate = (float(np.linalg.norm(a, axis=1).mean()) for a in (case.truth.v_B, case.truth.omega_B))
     paper = PAPER.get(row.name)
     beside = ["", ""] if paper is None else [f"{paper.speed_mps:.2f}", f"{paper.rate_rad_s:.2f}"]
-    events = sum(case.own.events) / row.seconds * 1e-6
+    events = sum(batch.n_events for batch in case.own.selected) / row.seconds * 1e-6
     return [row.name, f"{row.seconds:g}", f"{speed:.2f}", f"{rate:.2f}", f"{events:.2f}", *beside]
 
 

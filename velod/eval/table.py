@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ import numpy as np
 from velod.eval.compare import METHODS, Judged, Judgement
 from velod.eval.paper import PAPER
 from velod.eval.stage_errors import StageErrors
+from velod.eval.stage_tables import as_json as stages_as_json
 
 NONE_VALID = "*"
 REAL = "r"
@@ -110,26 +111,6 @@ def detail_table(rows: Sequence[Row]) -> list[list[str]]:
     return lines
 
 
-def stage_table(rows: Sequence[Row]) -> list[list[str]]:
-    """How far normal flow and disparity are from the simulator's truth; robust measures, sigmas in stated ones."""
-    head = [
-        *("sequence", "flows", "bias %", "spread %", "outliers %", "sigmas"),
-        *("disparities", "bias px", "MAD px", "wrong %", "sigmas"),
-    ]
-    lines = [head]
-    for row in rows:
-        s = row.stages
-        if s is None:
-            lines.append([row.name, *("-" for _ in head[1:])])
-            continue
-        flow = (100.0 * s.flow_bias, 100.0 * s.flow_spread, 100.0 * s.flow_outliers, s.flow_sigmas)
-        disparity = (s.disparity_bias_px, s.disparity_mad_px, 100.0 * s.disparity_wrong, s.disparity_sigmas)
-        of_flow = [f"{v:.2f}" for v in flow]
-        of_disparity = [*(f"{v:.3f}" for v in disparity[:2]), *(f"{v:.2f}" for v in disparity[2:])]
-        lines.append([row.name, str(s.flows), *of_flow, str(s.disparities), *of_disparity])
-    return lines
-
-
 def notes(rows: Sequence[Row], seeds: Sequence[int]) -> list[str]:
     """What the tables do not say by themselves."""
     count = "One noise" if len(seeds) < 2 else f"Mean ± standard deviation over {len(seeds)} noises"
@@ -200,9 +181,7 @@ def _row_json(row: Row) -> dict[str, Any]:
             "ave_mps": _spread_json(spread(j.metrics.ave_mps for j in row.imu_long)),
             "rve_percent": _spread_json(spread(j.metrics.rve_percent for j in row.imu_long)),
         },
-        "stages": None
-        if row.stages is None
-        else {name: value if math.isfinite(value) else None for name, value in asdict(row.stages).items()},
+        "stages": None if row.stages is None else stages_as_json(row.stages),
         "paper": None
         if paper is None
         else {

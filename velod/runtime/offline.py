@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Mapping
 
 from velod.config import Settings
 from velod.geometry.calibration import Calibration
-from velod.runtime.stages import STAGES, create_stage
+from velod.runtime.stages import STAGES, Stage, create_stage
 from velod.types import EventBatch, EventPacket, ImuPacket, Message, StereoBatch, Velocity
 
 
@@ -23,23 +23,47 @@ def run_offline(
     is filled with the counters of each stage by name.
     """
     stages = {name: create_stage(name, settings, calibration) for name in STAGES}
+    velocities: list[Velocity] = []
+    for estimate in _front_end(stages, packets, on_message):
+        for velocity in stages["optimizer"].handle(estimate):
+            _note(velocity, on_message)
+            if isinstance(velocity, Velocity):
+                velocities.append(velocity)
+    if counters is not None:
+        counters.update({name: dict(stage.counters) for name, stage in stages.items()})
+    return velocities
+
+
+def run_front_end(
+    settings: Settings,
+    calibration: Calibration,
+    packets: Iterable[EventPacket | ImuPacket],
+    on_message: Callable[[Message], None],
+) -> None:
+    """As ``run_offline``, but nothing is made of what flow and depth put out."""
+    stages = {name: create_stage(name, settings, calibration) for name in ("ingest", "flow", "depth")}
+    for _ in _front_end(stages, packets, on_message):
+        pass
+
+
+def _front_end(
+    stages: Mapping[str, Stage],
+    packets: Iterable[EventPacket | ImuPacket],
+    on_message: Callable[[Message], None] | None,
+) -> Iterator[Message]:
+    """The messages to the optimizer."""
     # What a message leads to is handled before the message's successor: the order of one ideal network.
     route = {EventBatch: stages["flow"], StereoBatch: stages["depth"]}
-    velocities: list[Velocity] = []
     for packet in packets:
         for selected in stages["ingest"].handle(packet):
             _note(selected, on_message)
             worker = route.get(type(selected))
-            for estimate in [selected] if worker is None else worker.handle(selected):
-                if worker is not None:
-                    _note(estimate, on_message)
-                for velocity in stages["optimizer"].handle(estimate):
-                    _note(velocity, on_message)
-                    if isinstance(velocity, Velocity):
-                        velocities.append(velocity)
-    if counters is not None:
-        counters.update({name: dict(stage.counters) for name, stage in stages.items()})
-    return velocities
+            if worker is None:
+                yield selected
+                continue
+            for estimate in worker.handle(selected):
+                _note(estimate, on_message)
+                yield estimate
 
 
 def _note(message: Message, on_message: Callable[[Message], None] | None) -> None:

@@ -21,37 +21,17 @@ I32 = NDArray[np.int32]
 U32 = NDArray[np.uint32]
 
 
-class Caster:
-    """Which surface of a scene each ray hits. ``depth`` (m, along the camera's z) and ``surface`` are (h, w)."""
-
-    def __init__(self, scene: Scene, rays: F32, focal_px: float) -> None:
-        """``rays`` (2, h, w): x' and y' of every pixel. ``focal_px``: about how many pixels make one unit of them."""
-        self.depth: F32 = np.zeros(rays.shape[1:], np.float32)
-        self.surface: I32 = np.zeros(rays.shape[1:], np.int32)
-        self._rays = rays
-        self._margin = 1.0 / focal_px
-        self._scene = scene
-        self._aimed: F32 = np.empty((len(scene.boxes), 19), np.float32)
-
-    def cast(self, R_WC: F64, p_WC: F64, areas: I64) -> None:
-        """Bring ``areas`` up to date for a camera at ``p_WC`` (m, in W) with axes ``R_WC``; both contiguous."""
-        scene, image = self._scene, (self._rays, areas, self.depth, self.surface)
-        if len(scene.shell) == 3:
-            _cast_corridor(scene.shell, R_WC, p_WC, *image)
-        else:
-            _cast_room(scene.shell, R_WC, p_WC, *image)
-            _aim(scene.boxes, R_WC, p_WC, self._aimed)
-            _cast_boxes(self._aimed, self._margin, *image)
-
-
 class Renderer:
     """One camera's view of a scene. ``depth`` (m, along z), ``surface`` and ``intensity`` (0..1) are (h, w)."""
 
     def __init__(self, scene: Scene, texture: Texture, camera: Camera) -> None:
         self._rays = rays_of(camera)
-        self._caster = Caster(scene, self._rays, camera.fx)
-        self.depth, self.surface = self._caster.depth, self._caster.surface
-        self.intensity: F32 = np.zeros(self.depth.shape, np.float32)
+        self._scene = scene
+        self._aimed: F32 = np.empty((len(scene.boxes), 19), np.float32)
+        shape = (camera.height, camera.width)
+        self.depth: F32 = np.zeros(shape, np.float32)
+        self.surface: I32 = np.zeros(shape, np.int32)
+        self.intensity: F32 = np.zeros(shape, np.float32)
         self._focal = np.array([camera.fx, camera.fy])
         self._texture = texture
         self._starts = texture.offset.astype(np.uint32)
@@ -63,7 +43,18 @@ class Renderer:
     def render(self, R_WC: F64, p_WC: F64, areas: I64) -> None:
         """Bring ``areas`` up to date for a camera at ``p_WC`` (m, in W) with axes ``R_WC``."""
         R_WC, p_WC = np.ascontiguousarray(R_WC), np.ascontiguousarray(p_WC)
-        self._caster.cast(R_WC, p_WC, areas)
+        cast_shell_and_boxes(
+            self._scene.shell,
+            self._scene.boxes,
+            R_WC,
+            p_WC,
+            self._rays,
+            areas,
+            self._aimed,
+            1.0 / self._focal[0],
+            self.depth,
+            self.surface,
+        )
         _shade(
             self._surfaces,
             self._texture.texels,
@@ -256,6 +247,32 @@ def _hit_box(box: F32, first: np.int32, xs: F32, ys: F32, depth: F32, surface: I
         hit = (enter <= leave) & (enter > zero) & (enter < z)
         depth[i] = enter if hit else z
         surface[i] = first + face if hit else surface[i]
+
+
+@njit(cache=True, nogil=True)
+def cast_shell_and_boxes(
+    shell: F64,
+    boxes: F64,
+    R_WC: F64,
+    p_WC: F64,
+    rays: F32,
+    areas: I64,
+    aimed: F32,
+    margin: float,
+    depth: F32,
+    surface: I32,
+) -> None:
+    """Which surface of a scene each ray of ``areas`` hits: ``depth`` (m, along the camera's z), ``surface``, (h, w).
+
+    ``rays`` (2, h, w): x' and y' of every pixel. ``aimed`` (boxes, 19): to work in. ``margin``: a pixel, on Z = 1;
+    boxes whose image lies further from an area are left out.
+    """
+    if shell.shape[0] == 3:
+        _cast_corridor(shell, R_WC, p_WC, rays, areas, depth, surface)
+    else:
+        _cast_room(shell, R_WC, p_WC, rays, areas, depth, surface)
+        _aim(boxes, R_WC, p_WC, aimed)
+        _cast_boxes(aimed, margin, rays, areas, depth, surface)
 
 
 _ROW = 2048
