@@ -164,7 +164,7 @@ def _rate(h: Health, prefix: str) -> float:
 
 
 _LOSS_PREFIXES = (
-    *("packets.", "events.", "imu.", "clock.", "batch.", "batches."),  # refused or missed by a stage
+    *("packets.", "events.", "imu.", "clock.", "batch.", "batches.", "shed."),  # refused or missed by a stage
     *("inbox.", "dispatch.", "wire.", "key.", "error.", "restart."),  # on the way between processes
 )
 

@@ -80,6 +80,12 @@ class IngestSettings:
         lo=1.0,
         hi=10_000.0,
     )
+    budget_ms: float = _f(
+        50.0,
+        "beside a sensor: while a batch or a packet waits for longer than this, less is taken on, ms; 0: never",
+        lo=0.0,
+        hi=10_000.0,
+    )
     imu_frozen_samples: int = _f(50, "so many identical IMU samples in a row mean a frozen IMU", lo=3, hi=100_000)
 
 

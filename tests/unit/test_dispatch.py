@@ -81,3 +81,34 @@ def test_the_only_worker_is_tried_again_after_a_lost_message() -> None:
 def test_nonsense_sizes_are_refused(window: int, capacity: int, timeout_s: float) -> None:
     with pytest.raises(ValueError, match="at least 1"):
         Dispatcher(window, capacity, timeout_s)
+
+
+def test_a_new_batch_waits_for_the_queue_or_for_the_least_loaded_worker() -> None:
+    d: Dispatcher[str] = Dispatcher(window=1)
+    d.join("flow-0", 0.0)
+    assert d.delay_s(1.0) == 0.0
+    d.submit(0, "", 1.0)
+    d.join("flow-1", 1.0)
+    assert d.delay_s(1.5) == 0.0, "flow-1 has nothing to do"
+    d.submit(1, "", 1.5)
+    d.submit(2, "", 2.0)
+    assert d.delay_s(2.3) == pytest.approx(0.3)
+    d.done("flow-1", 1, 2.4)
+    assert d.workers == {"flow-0": (0,), "flow-1": (2,)}
+    d.done("flow-1", 2, 2.5)
+    assert d.delay_s(2.5) == 0.0
+
+
+def test_the_delay_of_a_worker_with_room_is_its_oldest_batch() -> None:
+    d: Dispatcher[str] = Dispatcher(window=2)
+    d.join("flow-0", 0.0)
+    d.submit(0, "", 1.0)
+    assert d.delay_s(1.25) == pytest.approx(0.25)
+
+
+def test_old_batches_are_not_sent_but_counted() -> None:
+    d: Dispatcher[str] = Dispatcher(window=3, max_wait_s=0.5)
+    for i in range(3):
+        d.submit(i, "", 0.1 * i)
+    assert sent(d.join("flow-0", 0.65)) == [("flow-0", 2)]
+    assert d.counters == {"dispatch.stale": 2}

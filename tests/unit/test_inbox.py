@@ -49,3 +49,12 @@ def test_get_wakes_when_something_comes() -> None:
 
 def test_get_gives_up_after_its_timeout() -> None:
     assert inbox_of(2).get(0.01) is None
+
+
+def test_a_source_holds_no_more_bytes_than_it_may() -> None:
+    inbox = inbox_of(9)
+    inbox.add_source("large", 9, max_bytes=10)
+    items = [("large", b"1234"), ("b", b"x"), ("large", b"5678"), ("large", b"123456789"), ("large", b"y")]
+    assert filled(inbox, *items) == [b"x", b"123456789", b"y"]
+    assert inbox.counters == {"inbox.overflow.large": 2}
+    assert filled(inbox, ("large", b"longer than it may be")) == [b"longer than it may be"]

@@ -295,6 +295,15 @@ def test_a_restarted_clock_starts_all_over(back_ms: int) -> None:
     assert (batch.seq, batch.t_start_ns, batch.n_events) == (0, again, 1)
 
 
+def test_events_whose_times_do_not_go_on_are_held_up_to_a_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("velod.ingest.stream.MAX_QUEUED", 1000)
+    ingest = stage()
+    both(ingest, events([T0_NS]), T0_NS)
+    for seq in range(1, 40):
+        ingest.handle(events([T0_NS + 5 * MS] * 100).packet(seq, T0_NS + 5 * MS, "right"))
+    assert ingest.counters["events.overflow"] == 1 + 39 * 100 - 1000
+
+
 # --- IMU
 
 

@@ -7,6 +7,7 @@ more than ``max_skew_ms``) on how the packets of the cameras and the IMU interle
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from velod.events.sae import age_unit_ns, encode_ages, gather_patches, new_surfa
 from velod.events.selection import select_burst, select_paper
 from velod.geometry.calibration import Calibration
 from velod.ingest.batch import OpenBatch
+from velod.ingest.budget import Budget
 from velod.ingest.imu import ImuStream
 from velod.ingest.ordering import ClockRestart
 from velod.ingest.stream import CameraStream
@@ -27,19 +29,22 @@ Output = EventBatch | StereoBatch | ImuSamples
 class IngestStage:
     """Owns the surfaces of both cameras.
 
-    ``counters``: "batches", "batches.without_right", "clock.restart" and drops by cause ("packets.*", "events.*",
-    "imu.*"). ``alarms``: what is wrong at the moment ("camera.left", "camera.right", "imu.frozen").
+    ``counters``: "batches", "batches.without_right", "clock.restart", drops by cause ("packets.*", "events.*",
+    "imu.*") and by the budget ("shed.events", "shed.batches"). ``alarms``: what is wrong at the moment
+    ("camera.left", "camera.right", "imu.frozen"). ``budget``: what may be taken on, from the next message on.
     """
 
     def __init__(self, settings: Settings, calibration: Calibration) -> None:
         self.counters: Counter[str] = Counter()
         self.alarms: dict[str, str] = {}
+        self.budget = Budget()
         self._settings = settings
         self._calibration = calibration
         self._memory_ns = round(settings.ingest.memory_ms * 1e6)
         self._skew_ns = round(settings.ingest.max_skew_ms * 1e6)
         self._batch_seq = -1
         self._imu_seq = -1
+        self._turn = 0.0  # a batch is made when it reaches 1
         self._start_epoch()
 
     def _start_epoch(self) -> None:
@@ -73,7 +78,7 @@ class IngestStage:
             self._start_epoch()
             ordered = self._camera(packet).order.push(packet)
         for p in ordered:
-            self._camera(p).accept(p)
+            self._camera(p).accept(p, self.budget.band_rows)
         return self._close_batches() if ordered else []
 
     def _camera(self, packet: EventPacket) -> CameraStream:
@@ -114,7 +119,7 @@ class IngestStage:
             if batch.t_start_ns is None or batch.t_end_ns is None or not self._is_complete(batch.t_end_ns):
                 break
             if not batch.is_idle():
-                out += self._emit(batch.t_start_ns, batch.t_end_ns, batch.n)
+                out += self._emit_within_budget(batch.t_start_ns, batch.t_end_ns, batch.n)
             batch.begin_next()
         self._watch_skew()
         return out
@@ -138,6 +143,16 @@ class IngestStage:
                 self.alarms[f"camera.{name}"] = f"the {name} camera lags by more than {self._skew_ns / 1e6:g} ms"
             else:
                 self.alarms.pop(f"camera.{name}", None)
+
+    def _emit_within_budget(self, t_start_ns: int, t_end_ns: int, n_events: int) -> list[Output]:
+        """A batch that is not made has no number, so nobody waits for it."""
+        self._turn = min(self._turn, 1.0) + self.budget.batches
+        if self.budget.room <= 0 or self._turn < 1.0:
+            self.counters["shed.batches"] += 1
+            return [self._no_samples(t_end_ns)]
+        self._turn -= 1.0
+        self.budget = replace(self.budget, room=self.budget.room - 1)
+        return self._emit(t_start_ns, t_end_ns, n_events)
 
     def _emit(self, t_start_ns: int, t_end_ns: int, n_events: int) -> list[Output]:
         self._batch_seq += 1
@@ -163,27 +178,30 @@ class IngestStage:
 
     def _select(self, encoded: U16, t_start_ns: int, t_end_ns: int) -> tuple[U16, U16, np.ndarray, U8, np.ndarray]:
         s, fit, memory_ns = self._settings.ingest, self._settings.flow, self._memory_ns
+        quota = self.budget.quota(s.quota)
         if s.selection == "burst":
             surface = self._left.first
             x, y, p = select_burst(
                 surface, self._taken, encoded, t_start_ns, t_end_ns,
                 memory_ns=memory_ns, reject_px=fit.reject_px, rejections=fit.rejections,
                 min_neighbours=s.min_neighbours, max_rms_px=fit.max_rms_px,
-                border_px=s.border_px, quota=s.quota, seq=self._batch_seq,
+                border_px=s.border_px, quota=quota, seq=self._batch_seq,
             )  # fmt: skip
         else:
             surface = self._left.last
             x, y, p = select_paper(
                 surface, t_start_ns, t_end_ns,
                 memory_ns=memory_ns, time_share=s.paper_time_share,
-                border_px=s.border_px, quota=s.quota, seq=self._batch_seq,
+                border_px=s.border_px, quota=quota, seq=self._batch_seq,
             )  # fmt: skip
         age, patch = np.empty(len(x), np.uint32), np.empty((len(x), SIZE), np.uint32)
         gather_patches(surface, x, y, p, t_end_ns, memory_ns, age, patch)
         return x, y, age, p, patch
 
     def _no_samples(self, t_end_ns: int) -> ImuSamples:
-        """Tells the optimizer of a closed batch without waiting for the IMU."""
+        """Tells the optimizer how far the events have come without waiting for the IMU."""
         self._imu_seq += 1
         none, no_rows = np.empty(0, np.int64), np.empty((0, 3))
-        return ImuSamples(self._imu_seq, self._imu.t_ns, t_end_ns, self._batch_seq, t_end_ns, none, no_rows, no_rows)
+        return ImuSamples(
+            self._imu_seq, self._imu.t_ns, t_end_ns, self._batch_seq, self._batch_t_ns, none, no_rows, no_rows
+        )

@@ -11,17 +11,21 @@ from numpy.typing import NDArray
 from velod.config import IngestSettings
 from velod.events.columns import readonly
 from velod.events.sae import NEVER, new_surface, update_sae
+from velod.ingest.budget import BAND_ROWS
 from velod.ingest.ordering import PacketOrder
 from velod.types import I64, NS_PER_S, U8, U16, EventPacket
 
 I32 = NDArray[np.int32]
 
-DROPS = ("events.outside", "events.polarity", "events.backwards", "events.hot", "events.background")
-_OUTSIDE, _POLARITY, _BACKWARDS, _HOT, _BACKGROUND = range(5)
+DROPS = ("events.outside", "events.polarity", "events.backwards", "events.hot", "events.background", "shed.events")
+_OUTSIDE, _POLARITY, _BACKWARDS, _HOT, _BACKGROUND, _SHED = range(6)
+
+MAX_QUEUED = 1 << 22
+"""Events of one camera that wait for their batch: 200 ms (``max_skew_ms``) of 20 Mev/s. More means broken times."""
 
 
 class EventQueue:
-    """A growing first-in, first-out buffer of event columns."""
+    """A first-in, first-out buffer of event columns; it grows, and its owner keeps it within bounds."""
 
     def __init__(self) -> None:
         self._head = 0
@@ -82,15 +86,18 @@ class CameraStream:
         self._fired = np.zeros((*shape, 2), np.int32)
         self._width, self._height = width, height
 
-    def accept(self, packet: EventPacket) -> None:
-        """Queue the packet's good events, count the others by cause, move the watermark."""
+    def accept(self, packet: EventPacket, band_rows: int = BAND_ROWS) -> None:
+        """Queue the packet's good events, count the others by cause, move the watermark.
+
+        Of each BAND_ROWS rows the events of the first ``band_rows`` are looked at.
+        """
         n = len(packet.event_t_ns)
         dropped = np.zeros(len(DROPS), np.int64)
         x, y, t_ns, p = self.queue.reserve(n)
         kept = _check(
             readonly(packet.x, np.uint16), readonly(packet.y, np.uint16),
             readonly(packet.event_t_ns, np.int64), readonly(packet.p, np.uint8),
-            self._width, self._height, self.watermark_ns, x, y, t_ns, p, dropped,
+            self._width, self._height, self.watermark_ns, band_rows, x, y, t_ns, p, dropped,
         )  # fmt: skip
         if kept:
             self.watermark_ns = int(t_ns[kept - 1])
@@ -100,10 +107,17 @@ class CameraStream:
                 self._seen_ns, self._second, self._fired, dropped,
             )  # fmt: skip
         self.queue.commit(kept)
+        self._bound_queue()
         self.watermark_ns = max(self.watermark_ns, packet.t_ns)
         for cause, count in zip(DROPS, dropped.tolist(), strict=True):
             if count:
                 self._counters[cause] += count
+
+    def _bound_queue(self) -> None:
+        """Drop the oldest events where times do not go on and so no batch ends."""
+        if (excess := len(self.queue) - MAX_QUEUED) > 0:
+            self.queue.drop(excess)
+            self._counters["events.overflow"] += excess
 
     def enter_before(self, t_ns: int) -> I64:
         """Move the queued events earlier than ``t_ns`` into the surfaces; returns their times."""
@@ -123,13 +137,14 @@ def _check(
     width: int,
     height: int,
     not_before_ns: int,
+    band_rows: int,
     out_x: U16,
     out_y: U16,
     out_t_ns: I64,
     out_p: U8,
     dropped: I64,
 ) -> int:
-    """Copy the events that are on the sensor, of polarity 0 or 1 and in time order; returns how many."""
+    """Copy the events that are on the sensor, of polarity 0 or 1, in time order, in a kept row; returns how many."""
     n = 0
     for i in range(t_ns.size):
         if x[i] >= width or y[i] >= height:
@@ -140,6 +155,9 @@ def _check(
             dropped[_BACKWARDS] += 1
         else:
             not_before_ns = t_ns[i]
+            if y[i] % BAND_ROWS >= band_rows:
+                dropped[_SHED] += 1
+                continue
             out_x[n], out_y[n], out_t_ns[n], out_p[n] = x[i], y[i], t_ns[i], p[i]
             n += 1
     return n

@@ -23,6 +23,13 @@ class Assignment(Generic[T]):
     batch: T
 
 
+@dataclass(frozen=True, slots=True)
+class _Waiting(Generic[T]):
+    seq: int
+    batch: T
+    since_s: float
+
+
 @dataclass(slots=True)
 class _Worker(Generic[T]):
     # seq -> (batch, when it was sent), oldest first: what it has not finished.
@@ -34,26 +41,34 @@ class Dispatcher(Generic[T]):
     """Batches go to the worker with the fewest outstanding ones (ties: the lowest name), ``window`` each at the most.
 
     While every window is full, or nobody is there, batches wait in a queue of ``capacity`` (None: unbounded, for
-    lossless replay); when it is full the oldest are dropped and counted as ``dispatch.overflow``. What a worker had
-    not finished when it left is sent to others, before newer batches (``dispatch.resent``). A worker that does not
-    finish a batch in ``timeout_s`` is treated likewise (``dispatch.expired``), and then is given work only while
-    there is nobody else, until it finishes something: its message may have been lost, or it hangs.
+    lossless replay); when it is full the oldest are dropped and counted as ``dispatch.overflow``. One that waits for
+    longer than ``max_wait_s`` is dropped and counted as ``dispatch.stale``. What a worker had not finished when it
+    left is sent to others, before newer batches (``dispatch.resent``). A worker that does not finish a batch in
+    ``timeout_s`` is treated likewise (``dispatch.expired``), and then is given work only while there is nobody else,
+    until it finishes something: its message may have been lost, or it hangs.
     """
 
-    def __init__(self, window: int = 2, capacity: int | None = 64, timeout_s: float = math.inf) -> None:
-        if window < 1 or (capacity is not None and capacity < 1) or not timeout_s > 0.0:
-            raise ValueError("window and capacity must be at least 1, timeout_s positive")
+    def __init__(
+        self,
+        window: int = 2,
+        capacity: int | None = 64,
+        timeout_s: float = math.inf,
+        max_wait_s: float = math.inf,
+    ) -> None:
+        if window < 1 or (capacity is not None and capacity < 1) or not timeout_s > 0.0 or not max_wait_s > 0.0:
+            raise ValueError("window and capacity must be at least 1, timeout_s and max_wait_s positive")
         self.counters: dict[str, int] = {}
         self._window = window
         self._capacity = capacity
         self._timeout_s = timeout_s
+        self._max_wait_s = max_wait_s
         self._workers: dict[str, _Worker[T]] = {}
-        self._queue: deque[tuple[int, T]] = deque()
+        self._queue: deque[_Waiting[T]] = deque()
 
     def join(self, worker: str, now_s: float) -> list[Assignment[T]]:
         """A worker is there. One that is already known has been started anew: what it held is sent again."""
         if worker in self._workers:
-            self._requeue(self._workers[worker], "dispatch.resent")
+            self._requeue(self._workers[worker], "dispatch.resent", now_s)
         self._workers[worker] = _Worker()
         return self._assign(now_s)
 
@@ -61,12 +76,12 @@ class Dispatcher(Generic[T]):
         """A worker is gone."""
         gone = self._workers.pop(worker, None)
         if gone is not None:
-            self._requeue(gone, "dispatch.resent")
+            self._requeue(gone, "dispatch.resent", now_s)
         return self._assign(now_s)
 
     def submit(self, seq: int, batch: T, now_s: float) -> list[Assignment[T]]:
         """A new batch; ``seq`` identifies it."""
-        self._queue.append((seq, batch))
+        self._queue.append(_Waiting(seq, batch, now_s))
         assignments = self._assign(now_s)
         while self._capacity is not None and len(self._queue) > self._capacity:
             self._queue.popleft()
@@ -85,7 +100,7 @@ class Dispatcher(Generic[T]):
         """Call now and then: takes back what has been outstanding for too long."""
         for worker in self._workers.values():
             if any(now_s - sent_s > self._timeout_s for _, sent_s in worker.outstanding.values()):
-                self._requeue(worker, "dispatch.expired")
+                self._requeue(worker, "dispatch.expired", now_s)
                 worker.silent = True
         return self._assign(now_s)
 
@@ -97,19 +112,34 @@ class Dispatcher(Generic[T]):
     @property
     def waiting(self) -> tuple[int, ...]:
         """The batches that wait for a worker, the next one first."""
-        return tuple(seq for seq, _ in self._queue)
+        return tuple(waiting.seq for waiting in self._queue)
 
-    def _requeue(self, worker: _Worker[T], why: str) -> None:
-        self._queue.extendleft((seq, batch) for seq, (batch, _) in reversed(worker.outstanding.items()))
+    def delay_s(self, now_s: float) -> float:
+        """How long that has been there for which a new batch has to wait: the queue, or the next worker's own work.
+
+        0 where a worker has nothing to do.
+        """
+        if self._queue:
+            return now_s - self._queue[0].since_s
+        if (name := self._choose()) is None:
+            return 0.0
+        return now_s - min((sent_s for _, sent_s in self._workers[name].outstanding.values()), default=now_s)
+
+    def _requeue(self, worker: _Worker[T], why: str, now_s: float) -> None:
+        unfinished = reversed(worker.outstanding.items())
+        self._queue.extendleft(_Waiting(seq, batch, now_s) for seq, (batch, _) in unfinished)
         self._count(why, len(worker.outstanding))
         worker.outstanding.clear()
 
     def _assign(self, now_s: float) -> list[Assignment[T]]:
         assignments: list[Assignment[T]] = []
+        while self._queue and now_s - self._queue[0].since_s > self._max_wait_s:
+            self._queue.popleft()
+            self._count("dispatch.stale", 1)
         while self._queue and (name := self._choose()) is not None:
-            seq, batch = self._queue.popleft()
-            self._workers[name].outstanding[seq] = (batch, now_s)
-            assignments.append(Assignment(name, seq, batch))
+            waiting = self._queue.popleft()
+            self._workers[name].outstanding[waiting.seq] = (waiting.batch, now_s)
+            assignments.append(Assignment(name, waiting.seq, waiting.batch))
         return assignments
 
     def _choose(self) -> str | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 
 from velod.runtime.dispatch import Assignment, Dispatcher
@@ -18,6 +17,8 @@ QUEUE = 64
 """Batches that wait while no worker is free; at 50 a second more than a second's worth."""
 TIMEOUT_S = 2.0
 """A worker that has not finished a batch by then has lost it, or hangs."""
+MAX_WAIT_S = 0.5
+"""A batch that has waited for longer is not sent any more: half the optimizer's window is over."""
 
 _TOPIC: dict[str, Topic] = {"flow": BATCH_FLOW, "depth": BATCH_DEPTH}
 
@@ -28,7 +29,7 @@ class BatchDispatch:
     def __init__(self, outlet: Outlet, lossless: bool) -> None:
         self._outlet = outlet
         self._dispatchers: dict[str, Dispatcher[bytes]] = {
-            stage: Dispatcher(WINDOW, None if lossless else QUEUE, math.inf if lossless else TIMEOUT_S)
+            stage: Dispatcher(WINDOW, None) if lossless else Dispatcher(WINDOW, QUEUE, TIMEOUT_S, MAX_WAIT_S)
             for stage in _TOPIC
         }
 
@@ -57,6 +58,11 @@ class BatchDispatch:
         """Take back what has been outstanding for too long; call a few times a second."""
         for stage, dispatcher in self._dispatchers.items():
             self._put(stage, dispatcher.expire(time.monotonic()))
+
+    def load(self) -> tuple[float, int]:
+        """Of the busier stage: how long a new batch's predecessors have been there, s, and how many wait."""
+        now_s, stages = time.monotonic(), self._dispatchers.values()
+        return max(d.delay_s(now_s) for d in stages), max(len(d.waiting) for d in stages)
 
     def counters(self) -> dict[str, int]:
         """Counters of both dispatchers, ``dispatch.overflow.flow`` and so on."""

@@ -22,11 +22,33 @@ class Item:
 class _Source:
     capacity: int
     urgent: bool
+    max_bytes: int | None
+    held_bytes: int = 0
     items: deque[Item] = field(default_factory=deque)
+
+    def make_room(self, n_bytes: int) -> int:
+        """Drop the oldest items until one of ``n_bytes`` fits; returns how many."""
+        dropped = 0
+        while self.items and (
+            len(self.items) >= self.capacity
+            or (self.max_bytes is not None and self.held_bytes + n_bytes > self.max_bytes)
+        ):
+            self.pop()
+            dropped += 1
+        return dropped
+
+    def push(self, item: Item) -> None:
+        self.items.append(item)
+        self.held_bytes += len(item.data)
+
+    def pop(self) -> Item:
+        item = self.items.popleft()
+        self.held_bytes -= len(item.data)
+        return item
 
 
 class Inbox:
-    """One queue per source, each bounded: when one is full its oldest item makes room, and that is counted.
+    """One queue per source, each bounded: when one is full its oldest items make room, and that is counted.
 
     ``put`` never blocks, so a slow worker holds up no thread of the network. ``get`` serves urgent sources first,
     and otherwise all in the order of arrival.
@@ -39,23 +61,27 @@ class Inbox:
         self._urgent_turns: deque[str] = deque()
         self._ready = threading.Condition()
 
-    def add_source(self, name: str, capacity: int, urgent: bool = False) -> None:
-        """Accept items of source ``name``, ``capacity`` of them at once; urgent ones overtake all others."""
+    def add_source(self, name: str, capacity: int, urgent: bool = False, max_bytes: int | None = None) -> None:
+        """Accept items of source ``name``, ``capacity`` of them at once, and no more of them than ``max_bytes``
+        (but one); urgent ones overtake all others.
+        """
         with self._ready:
-            self._sources[name] = _Source(capacity, urgent)
+            self._sources[name] = _Source(capacity, urgent, max_bytes)
 
     def put(self, source: str, key: str, data: bytes) -> None:
         """Add an item; called from any thread."""
         with self._ready:
             queue = self._sources[source]
-            if len(queue.items) >= queue.capacity:
-                # The turn of the item dropped here serves the one after it.
-                queue.items.popleft()
+            turns = self._urgent_turns if queue.urgent else self._turns
+            if dropped := queue.make_room(len(data)):
                 name = f"inbox.overflow.{source}"
-                self.counters[name] = self.counters.get(name, 0) + 1
+                self.counters[name] = self.counters.get(name, 0) + dropped
+                # The turn of the last item dropped serves the one after it.
+                for _ in range(dropped - 1):
+                    turns.remove(source)
             else:
-                (self._urgent_turns if queue.urgent else self._turns).append(source)
-            queue.items.append(Item(source, key, data, time.time_ns()))
+                turns.append(source)
+            queue.push(Item(source, key, data, time.time_ns()))
             self._ready.notify()
 
     def get(self, timeout_s: float) -> Item | None:
@@ -64,7 +90,7 @@ class Inbox:
             if not self._ready.wait_for(lambda: bool(self._urgent_turns or self._turns), timeout_s):
                 return None
             turns = self._urgent_turns or self._turns
-            return self._sources[turns.popleft()].items.popleft()
+            return self._sources[turns.popleft()].pop()
 
     def waiting(self) -> int:
         """Items queued now."""

@@ -24,7 +24,18 @@ from velod.wire.topics import HEALTH, VELOCITY, Topic, key
 START_S = 180.0
 POLL_S = 0.02
 _COLLECTED = 1 << 20
-_LOSSES = ("gap.", "inbox.", "dispatch.overflow", "wire.", "error.", "packets.gap", "packets.late", "batch.lost")
+_LOSSES = (
+    "gap.",
+    "inbox.",
+    "dispatch.overflow",
+    "dispatch.stale",
+    "shed.",
+    "wire.",
+    "error.",
+    "packets.gap",
+    "packets.late",
+    "batch.lost",
+)
 
 
 class OnlineError(RuntimeError):

@@ -11,11 +11,12 @@ from typing import ClassVar
 import zenoh
 
 from velod.config import Settings
+from velod.runtime.budget import LoadShedder
 from velod.runtime.dispatching import BatchDispatch
 from velod.runtime.inbox import Item
 from velod.runtime.measure import SensorClock
 from velod.runtime.shell import WorkerShell
-from velod.runtime.stages import Stage
+from velod.runtime.stages import Limited, Stage
 from velod.types import DepthBatch, Done, EventBatch, FlowBatch, ImuSamples, Message, Odometry, StereoBatch, Velocity
 from velod.wire import Envelope
 from velod.wire.topics import (
@@ -49,6 +50,8 @@ class IngestShell(WorkerShell):
     ) -> None:
         super().__init__(session, settings, stage_name, worker, stage)
         self._dispatch = BatchDispatch(self.outlet, settings.zenoh.lossless)
+        # A lossless replay waits for the slowest instead.
+        self._load = LoadShedder(0.0 if settings.zenoh.lossless else 1e-3 * settings.ingest.budget_ms)
 
     def subscribe(self, stack: ExitStack) -> None:
         """The sensor, answers of workers, and their coming and going."""
@@ -65,11 +68,19 @@ class IngestShell(WorkerShell):
         self.inbox.put(_TOKENS, str(sample.key_expr), _CAME if came else _WENT)
 
     def take_other(self, item: Item) -> bool:
-        """Workers that come and go."""
-        if item.source != _TOKENS:
+        """Workers that come and go, and event packets that are too old; the others come within a new budget."""
+        if item.source == _TOKENS:
+            self._dispatch.alive(item.key, item.data == _CAME)
+            return True
+        if item.source != EVENTS.name:
             return False
-        self._dispatch.alive(item.key, item.data == _CAME)
-        return True
+        now_s = time.monotonic()
+        if not self._load.takes_packet((time.time_ns() - item.t_ns) * 1e-9, now_s):
+            return True
+        self._load.note_workers(*self._dispatch.load(), now_s)
+        if isinstance(self.stage, Limited):
+            self.stage.budget = self._load.budget()
+        return False
 
     def consumers(self) -> list[tuple[Topic, dict[str, str]]]:
         """The optimizer."""
@@ -86,22 +97,25 @@ class IngestShell(WorkerShell):
         for output in outputs:
             if isinstance(output, EventBatch | StereoBatch):
                 self._dispatch.send(output, t_origin_ns)
+                if isinstance(output, EventBatch):
+                    self._load.note_batch()
                 self.health.add_latency("stage", time.time_ns() - cause.t_pub_ns)
             elif isinstance(output, ImuSamples):
                 self.outlet.publish(IMU, output, t_origin_ns)
 
     def every_second(self) -> None:
         """Health, and batches that nobody answered for."""
+        self._load.end_period(self.stage.counters)
         super().every_second()
         self._dispatch.expire()
 
     def counters(self) -> dict[str, int]:
-        """With those of dispatch."""
-        return {**super().counters(), **self._dispatch.counters()}
+        """With those of dispatch and of the load that was shed."""
+        return {**super().counters(), **self._dispatch.counters(), **self._load.counters}
 
     def alarms(self) -> dict[str, str]:
-        """With those of dispatch."""
-        return {**super().alarms(), **self._dispatch.alarms()}
+        """With those of dispatch and of the load."""
+        return {**super().alarms(), **self._dispatch.alarms(), **self._load.alarms()}
 
 
 class BatchShell(WorkerShell):

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from importlib import import_module
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from velod.config import Settings
 from velod.geometry.calibration import Calibration
+from velod.ingest.budget import Budget
 from velod.types import Message
 
 STAGES = ("ingest", "flow", "depth", "optimizer")
@@ -24,6 +25,13 @@ class Stage(Protocol):
     def handle(self, message: Any, /) -> Sequence[Message]:
         """What follows from one message, in the order in which it is to be published."""
         ...
+
+
+@runtime_checkable
+class Limited(Protocol):
+    """A stage that can be told how much to take on."""
+
+    budget: Budget
 
 
 _CLASSES = {

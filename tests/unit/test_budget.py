@@ -1,0 +1,154 @@
+"""Load shedding: shares fall while something is late, recover by themselves, and ingest keeps to its budget."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.moving_edges import T0_NS, calibration, edges, event_batches, settings
+from velod.ingest.budget import BAND_ROWS, LEAST_ROWS, Budget
+from velod.ingest.stage import IngestStage
+from velod.runtime.budget import LEAST_SELECTION, MAX_WAITING, NO_PACKET, LoadShedder
+from velod.types import ImuSamples, StereoBatch
+
+TARGET_S = 0.05
+
+
+def run(load: LoadShedder, delay_s: float, start_s: float, seconds: float) -> float:
+    """The workers are late by ``delay_s`` for so long, told every 10 ms; returns when that is over."""
+    steps = round(seconds / 0.01)
+    for i in range(steps):
+        load.note_workers(delay_s, 0, start_s + 0.01 * i)
+    return start_s + seconds
+
+
+def test_without_delay_everything_is_taken_on() -> None:
+    load = LoadShedder(TARGET_S)
+    now_s = run(load, 0.4 * TARGET_S, 0.0, 1.0)
+    assert load.takes_packet(0.4 * TARGET_S, now_s)
+    assert load.budget() == Budget(room=MAX_WAITING)
+
+
+def test_late_workers_get_fewer_events_then_no_batches_and_all_again_when_they_are_not() -> None:
+    load = LoadShedder(TARGET_S)
+    now_s = run(load, 1.5 * TARGET_S, 0.0, 0.2)
+    assert LEAST_SELECTION < load.budget().selection < 0.6
+    assert load.budget().room == MAX_WAITING
+    now_s = run(load, 2.5 * TARGET_S, now_s, 2.0)
+    assert load.budget().selection == LEAST_SELECTION
+    assert load.budget().room == 0
+    now_s = run(load, 0.0, now_s, 1.0)
+    assert 0.5 < load.budget().selection < 0.7
+    run(load, 0.0, now_s, 1.0)
+    assert load.budget() == Budget(room=MAX_WAITING)
+
+
+def test_an_ingest_that_is_late_makes_fewer_batches_then_looks_at_fewer_rows() -> None:
+    load = LoadShedder(TARGET_S)
+    for i in range(20):
+        assert load.takes_packet(1.5 * TARGET_S, 0.01 * i)
+    assert 0.3 < load.budget().batches < 0.6
+    assert load.budget().rows == 1.0
+    for i in range(20, 60):
+        assert load.takes_packet(2.5 * TARGET_S, 0.01 * i)
+    assert load.budget().rows < 0.6
+    for i in range(60, 300):
+        assert load.takes_packet(0.0, 0.01 * i)
+    assert load.budget() == Budget(room=MAX_WAITING)
+
+
+def test_batches_are_made_only_while_there_is_room_to_wait() -> None:
+    load = LoadShedder(TARGET_S)
+    load.note_workers(0.0, MAX_WAITING - 3, 0.0)
+    assert load.budget().room == 3
+    load.note_workers(0.0, MAX_WAITING + 1, 0.0)
+    assert load.budget().room == 0
+
+
+def test_old_packets_are_dropped_until_the_backlog_is_gone_and_counted() -> None:
+    load = LoadShedder(TARGET_S)
+    waited = np.array([0.5, NO_PACKET - 0.1, NO_PACKET + 0.1, 2.5, 2.1, 1.9, 2.5]) * TARGET_S
+    assert [load.takes_packet(w, 0.01 * i) for i, w in enumerate(waited)] == [
+        True,
+        True,
+        False,
+        False,
+        False,
+        True,
+        True,
+    ]
+    assert load.counters == {"shed.packets": 3}
+
+
+def test_health_tells_the_share_of_the_period_and_raises_an_alarm_while_it_is_small() -> None:
+    load = LoadShedder(TARGET_S)
+    run(load, 1.5 * TARGET_S, 0.0, 1.0)
+    load.note_batch()
+    load.end_period({"shed.batches": 1})
+    share = load.budget().selection
+    assert load.shares() == {"share.selection": share / 2, "share.events": 1.0}
+    assert f"{share / 2:.0%} of the quota" in load.alarms()["load.selection"]
+    run(load, 0.0, 1.0, 2.0)
+    load.note_batch()
+    load.end_period({"shed.batches": 1})
+    assert load.shares()["share.selection"] == 1.0
+    assert load.alarms() == {}
+
+
+def test_a_target_of_zero_sheds_nothing() -> None:
+    load = LoadShedder(0.0)
+    load.note_workers(100.0, 1000, 0.0)
+    assert load.takes_packet(100.0, 0.0)
+    assert load.budget() == Budget()
+
+
+# --- the stage keeps to it
+
+
+def handled(budget: Budget) -> tuple[IngestStage, list[object]]:
+    ingest = IngestStage(settings(), calibration())
+    ingest.budget = budget
+    e = edges(seconds=0.1)
+    out = [
+        *ingest.handle(e.packet(0, T0_NS + 100_000_000, "right")),
+        *ingest.handle(e.packet(0, T0_NS + 100_000_000)),
+    ]
+    return ingest, out
+
+
+def test_a_batch_selects_its_share_of_the_quota() -> None:
+    quota = settings().ingest.quota
+    sizes = [max(len(b.x) for b in event_batches(handled(Budget(selection=s))[1])) for s in (1.0, 0.2)]
+    assert sizes[0] > 0.2 * quota
+    assert sizes[1] == round(0.2 * quota)
+
+
+def test_batches_beyond_the_budget_have_no_number_and_the_optimizer_is_told_to_go_on() -> None:
+    everything, (ingest, out) = event_batches(handled(Budget())[1]), handled(Budget(room=2))
+    assert [b.seq for b in event_batches(out)] == [0, 1]
+    assert ingest.counters["batches"] == 2
+    assert ingest.counters["shed.batches"] == len(everything) - 2
+    last = [m for m in out if isinstance(m, ImuSamples)][-1]
+    assert (last.batch_seq, last.batch_t_ns, last.event_t_ns) == (1, everything[1].t_ns, everything[-1].t_ns)
+
+
+def test_a_share_of_the_batches_is_spread_evenly() -> None:
+    everything = event_batches(handled(Budget())[1])
+    made = event_batches(handled(Budget(batches=1 / 3))[1])
+    assert [b.t_ns for b in made] == [b.t_ns for b in everything[2::3]]
+
+
+def test_thinning_keeps_whole_rows_the_same_in_both_cameras_and_counts_the_rest() -> None:
+    ingest, out = handled(Budget(rows=0.5))
+    stereo = [m for m in out if isinstance(m, StereoBatch)][-1]
+    rows = np.arange(stereo.left_last.shape[0])
+    kept = rows % BAND_ROWS < BAND_ROWS // 2
+    for surface in (stereo.left_last, stereo.right_last):
+        assert surface[kept].any(axis=1).all()
+        assert not surface[~kept].any()
+    assert ingest.counters["shed.events"] == 2 * np.count_nonzero(~kept[edges(seconds=0.1).y])
+
+
+@pytest.mark.parametrize(("rows", "kept"), [(1.0, BAND_ROWS), (0.75, 48), (0.0, LEAST_ROWS)])
+def test_enough_rows_stay_side_by_side_for_a_block(rows: float, kept: int) -> None:
+    assert Budget(rows=rows).band_rows == kept

@@ -1,0 +1,133 @@
+"""Load shedding: what ingest may take on, from how late its workers and it itself are.
+
+Late means waiting: a batch that is not finished, a packet that has not been looked at. While something is later than
+a target, less is taken on: fewer events, then fewer batches or packets, never old ones. No input or output and no
+clock here; ``now_s`` is any clock that does not go backwards.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from velod.ingest.budget import BAND_ROWS, LEAST_ROWS, Budget
+
+FALL = 0.8
+"""A share is multiplied by this while something is late, once in the time that is late."""
+RISE_PER_S = 0.5
+"""A share grows by so much in a second while nothing is."""
+CALM = 0.5
+"""Shares grow while nothing is later than this part of the target."""
+LEAST_SELECTION = 0.1
+"""With fewer events a batch costs hardly less, and says little: then there are fewer batches."""
+LEAST_BATCHES = 0.1
+NO_BATCH = 2.0
+"""While a batch is later than this many targets, no further one is made."""
+FEWER_ROWS = 2.0
+"""While a packet waits for more than this many targets, fewer rows are looked at: fewer batches were not enough."""
+NO_PACKET, PACKETS_AGAIN = 3.0, 2.0
+"""Once an event packet has waited for this many targets, all are dropped until one has waited for so few."""
+MAX_WAITING = 8
+"""Batches that may wait for a worker at once; each holds the surfaces of both cameras."""
+ALARM_BELOW = 0.95
+_PERIOD_S = 1.0
+
+
+@dataclass(slots=True)
+class Share:
+    """A share of the load that falls quickly while there is delay, and rises slowly while there is none."""
+
+    target_s: float
+    least: float
+    value: float = 1.0
+    _last_s: float = math.inf
+    _patience_s: float = -math.inf  # no further fall before: the last one has not had its effect
+
+    def note(self, delay_s: float, now_s: float) -> None:
+        """What is waiting now has waited for ``delay_s``."""
+        elapsed_s = max(0.0, now_s - self._last_s)
+        self._last_s = now_s
+        if delay_s > self.target_s:
+            if now_s >= self._patience_s:
+                self.value = max(self.least, self.value * FALL)
+                self._patience_s = now_s + self.target_s
+        elif delay_s < CALM * self.target_s:
+            self.value = min(1.0, self.value + RISE_PER_S * min(elapsed_s, _PERIOD_S))
+
+
+@dataclass(slots=True)
+class LoadShedder:
+    """Ingest's budget. ``target_s`` 0: nothing is ever shed."""
+
+    target_s: float
+    counters: dict[str, int] = field(default_factory=dict)
+    _selection: Share = field(init=False)
+    _batches: Share = field(init=False)
+    _rows: Share = field(init=False)
+    _room: int = MAX_WAITING
+    _dropping: bool = False
+    _shed: int = 0  # batches, when the last period ended
+    _made: int = 0  # batches of this period, and how much of the quota they had
+    _selected: float = 0.0
+    _packets: int = 0  # of this period, and how much of them was looked at
+    _looked_at: float = 0.0
+    _used: tuple[float, float] = (1.0, 1.0)
+
+    def __post_init__(self) -> None:
+        self._selection = Share(self.target_s, LEAST_SELECTION)
+        self._batches = Share(self.target_s, LEAST_BATCHES)
+        self._rows = Share(FEWER_ROWS * self.target_s, LEAST_ROWS / BAND_ROWS)
+
+    def note_workers(self, delay_s: float, waiting: int, now_s: float) -> None:
+        """What a new batch has to wait for has been there for ``delay_s``; ``waiting`` batches have not been sent."""
+        self._selection.note(delay_s, now_s)
+        self._room = 0 if delay_s > NO_BATCH * self.target_s else max(0, MAX_WAITING - waiting)
+
+    def takes_packet(self, waited_s: float, now_s: float) -> bool:
+        """Whether an event packet that has waited for so long is to be looked at; else it is counted and dropped."""
+        if not self.target_s:
+            return True
+        self._batches.note(waited_s, now_s)
+        self._rows.note(waited_s, now_s)
+        self._dropping = waited_s > (PACKETS_AGAIN if self._dropping else NO_PACKET) * self.target_s
+        if self._dropping:
+            self.counters["shed.packets"] = self.counters.get("shed.packets", 0) + 1
+        self._packets += 1
+        self._looked_at += 0.0 if self._dropping else self._rows.value
+        return not self._dropping
+
+    def budget(self) -> Budget:
+        """What may be taken on now."""
+        if not self.target_s:
+            return Budget()
+        return Budget(self._selection.value, self._rows.value, self._batches.value, self._room)
+
+    def note_batch(self) -> None:
+        """A batch was made within the budget."""
+        self._made += 1
+        self._selected += self._selection.value if self.target_s else 1.0
+
+    def end_period(self, counters: Mapping[str, int]) -> None:
+        """A period of health ends, with these counters of ingest; ``shares`` and ``alarms`` now speak of it."""
+        shed = counters.get("shed.batches", 0)
+        batches, self._shed = self._made + shed - self._shed, shed
+        self._used = (
+            self._selected / batches if batches else 1.0,
+            self._looked_at / self._packets if self._packets else 1.0,
+        )
+        self._made, self._selected, self._packets, self._looked_at = 0, 0.0, 0, 0.0
+
+    def shares(self) -> dict[str, float]:
+        """Shares of the period: of the selection (batches that were not made count 0), and of the events."""
+        return {"share.selection": self._used[0], "share.events": self._used[1]}
+
+    def alarms(self) -> dict[str, str]:
+        """What was shed in the period."""
+        selection, rows = self._used
+        out = {}
+        if selection < ALARM_BELOW:
+            out["load.selection"] = f"the workers or ingest cannot keep up: {selection:.0%} of the quota is used"
+        if rows < ALARM_BELOW:
+            out["load.events"] = f"ingest cannot keep up: {rows:.0%} of the events are looked at"
+        return out
