@@ -28,6 +28,9 @@ class Motion:
     def R_WB(self, t):
         return exp(np.array([1.8, 0.3, -0.2])) @ exp(self.w_B * t)
 
+    def omega_B(self, t):
+        return self.w_B
+
     def v_B(self, t):
         return self.R_WB(t).T @ (self.v0_W + self.amplitude * np.sin(self.rate * t))
 
@@ -42,6 +45,16 @@ FLIGHT = Motion(
 SPIN = Motion(
     np.array([2.0, -12.0, 5.0]), np.array([1.0, 2.0, 0.0]), np.array([3.0, 3.0, 1.0]), np.array([6.0, 5.0, 7.0])
 )
+
+
+class Shaking(Motion):
+    """Looks to and fro about the axis ``w_B``, up to its rate, at 1.5 Hz."""
+
+    def R_WB(self, t):
+        return exp(np.array([1.8, 0.3, -0.2])) @ exp(self.w_B * np.sin(3.0 * np.pi * t) / (3.0 * np.pi))
+
+    def omega_B(self, t):
+        return self.w_B * np.cos(3.0 * np.pi * t)
 
 
 class Braking(Motion):
@@ -71,7 +84,10 @@ def messages(
         np.array([motion.accel(t) for t in imu_t])
         + rng.normal(size=(len(imu_t), 3)) * 1.86e-2 * np.sqrt(imu_hz) * noise
     )
-    gyro = np.tile(motion.w_B, (len(imu_t), 1)) + rng.normal(size=(len(imu_t), 3)) * 1.86e-3 * np.sqrt(imu_hz) * noise
+    gyro = (
+        np.array([motion.omega_B(t) for t in imu_t])
+        + rng.normal(size=(len(imu_t), 3)) * 1.86e-3 * np.sqrt(imu_hz) * noise
+    )
     imu_ns = np.round(imu_t * 1e9).astype(np.int64)
     nothing = ImuSamples(0, 0, 0, -1, 0, imu_ns[:0], accel[:0], gyro[:0])
     out, sent = [nothing], 0
@@ -91,9 +107,10 @@ def messages(
 def _front_end(motion, rng, seq, end_ns, period_ns, m, noise, outliers):
     age = rng.integers(1, period_ns, m)
     v = np.array([motion.v_B((end_ns - a) * 1e-9) for a in age]).reshape(-1, 3)
+    omega = np.array([motion.omega_B((end_ns - a) * 1e-9) for a in age]).reshape(-1, 3)
     x, y, Z = rng.uniform(10, 336, m), rng.uniform(10, 250, m), rng.uniform(1.5, 6.0, m)
     u, w, f = x - CAMERA.cx, y - CAMERA.cy, CAMERA.fx
-    flow = np.einsum("mij,mj->mi", A_v(u, w, f), v) / Z[:, None] + B_w(u, w, f) @ motion.w_B
+    flow = np.einsum("mij,mj->mi", A_v(u, w, f), v) / Z[:, None] + np.einsum("mij,mj->mi", B_w(u, w, f), omega)
     angle = rng.uniform(0, 2 * np.pi, m)
     n = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     n *= np.sign(np.sum(flow * n, axis=1))[:, None]

@@ -162,6 +162,15 @@ class OptimizerSettings:
     shared_error: float = _f(
         10.0, "information of a batch is divided by this for errors its flows share", lo=1.0, hi=100.0
     )
+    flow_scale_sigma: float = _f(
+        0.004, "1 sigma of an error of all flows' speeds, as a share, which lasts a second", above=0.0, hi=0.1
+    )
+    depth_scale_sigma: float = _f(
+        0.003, "1 sigma of an error of all inverse depths, as a share, which lasts a second", above=0.0, hi=0.1
+    )
+    delay_sigma_ms: float = _f(
+        1.0, "1 sigma of how much later than the IMU's the events' stamps are, ms", above=0.0, hi=100.0
+    )
     zero_velocity: bool = _f(True, "rest is observed as zero velocity: no moving events and a quiet IMU")
     ransac_iterations: int = _f(64, "minimal samples of the linear solver (Eq. 15)", lo=8, hi=10_000)
     min_flows: int = _f(12, "flows with a depth that a batch must have", lo=6, hi=10_000)

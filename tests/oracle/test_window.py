@@ -9,22 +9,23 @@ from velod.geometry.so3 import exp, hat
 from velod.optimizer.estimator import Estimator, Head
 from velod.optimizer.preintegration import preintegrate
 from velod.optimizer.stage import OptimizerStage
-from velod.optimizer.window import HEAD, Window
+from velod.optimizer.window import BLOCK, HEAD, Window
 from velod.types import ImuSamples, Velocity
 
 KNOT_NS = 100_000_000
+COMMON_SIGMA = np.array([0.004, 0.001, 0.003])
 
 
 def filled(segments, rng):
     """A window that has lived through 12 segments with the same random factors, keeping ``segments`` of them."""
-    w = Window(ImuSettings(), KNOT_NS, segments, smoothness=0.5)
+    w = Window(ImuSettings(), KNOT_NS, segments, smoothness=0.5, common_sigma=COMMON_SIGMA)
     w.start(0)
     for k in range(12):
         if k:
             w.extend(exp(rng.normal(size=3)) * 0.1, rng.normal(size=3) * 10, rng.normal(size=3) * 0.01, 0.1)
         for _ in range(4):
             t = int((k + rng.uniform(0, 1)) * KNOT_NS)
-            J = rng.normal(size=(8, 6))
+            J = rng.normal(size=(8, 9))
             w.add_information(t, J.T @ J, J.T @ rng.normal(size=8))
     return w
 
@@ -57,8 +58,9 @@ def test_the_solution_in_the_envelope_is_that_of_dense_algebra(segments):
     H += J.T @ information @ J
     h += J.T @ information @ r
     direction, sigma = g / np.linalg.norm(g), 0.02 + 9.81 * 0.01**2
-    H[-3:, -3:] += np.outer(direction, direction) / sigma**2
-    h[-3:] += direction * 9.81 / sigma**2
+    newest = w.gravity_columns(w.last)
+    H[np.ix_(newest, newest)] += np.outer(direction, direction) / sigma**2
+    h[newest] += direction * 9.81 / sigma**2
     P = np.linalg.inv(H)
     assert np.abs((solution.x - P @ h) / np.sqrt(np.diag(P))).max() < 1e-5
     F = w.selector(int((w.last + 0.6) * KNOT_NS))
@@ -76,7 +78,7 @@ def test_an_information_that_determines_nothing_is_refused():
 def test_what_leaves_the_window_is_a_schur_complement():
     w = filled(4, np.random.default_rng(6))
     H, h = dense(w)
-    gone = np.r_[0:3, HEAD + 3 : HEAD + 12]
+    gone = np.r_[0:3, HEAD + 3 : HEAD + BLOCK]
     kept = np.setdiff1d(np.arange(w.size), gone)
     gain = np.linalg.solve(H[np.ix_(gone, gone)], np.column_stack([H[np.ix_(gone, kept)], h[gone]]))
     w._marginalise_oldest()
@@ -106,10 +108,11 @@ def test_information_of_a_moment_is_spread_by_the_spline():
     rng = np.random.default_rng(9)
     w = filled(4, rng)
     H, h = dense(w)
-    root, eta, t = rng.normal(size=(6, 6)), rng.normal(size=6), int(9.3 * KNOT_NS)
+    root, eta, t = rng.normal(size=(9, 9)), rng.normal(size=9), int(9.3 * KNOT_NS)
     L = root @ root.T
     w.add_information(t, L, eta)
-    spread = w.selector(t)[[0, 1, 2, 6, 7, 8]]
+    common = np.eye(w.size)[w.common_columns(9)]
+    spread = np.vstack([w.selector(t)[[0, 1, 2, 6, 7, 8]], common])
     assert np.allclose(dense(w)[0], H + spread.T @ L @ spread)
     assert np.allclose(dense(w)[1], h + spread.T @ eta)
 
@@ -125,7 +128,7 @@ def test_blocks_between_two_moments_are_spread_over_their_control_points():
 def test_the_window_keeps_its_size():
     w = filled(4, np.random.default_rng(1))
     assert (w.first, w.last) == (8, 11)
-    assert w.size == HEAD + 4 * 12
+    assert w.size == HEAD + 4 * BLOCK
     assert w.contains(8 * KNOT_NS)
     assert not w.contains(8 * KNOT_NS - 1)
 
@@ -163,7 +166,7 @@ def estimator(request):
     b_a, b_w = np.array([0.1, -0.2, 0.15]), np.array([0.02, -0.03, 0.01])
     R_LB = e.memory.at(np.array([250_000_000]))[0][0]
     g_L = np.array([1.0, -9.0, 3.0])
-    e.head = Head(250_000_000, np.array([3.0, -1.0, 2.0]), b_a, b_w, g_L, R_LB, np.eye(12) * 1e-4)
+    e.head = Head(250_000_000, np.array([3.0, -1.0, 2.0]), b_a, b_w, g_L, R_LB, np.eye(12) * 1e-4, np.zeros(3))
     return e
 
 
@@ -238,7 +241,7 @@ def test_the_covariance_carried_by_the_imu_is_that_of_its_jacobian(estimator):
         for sign in (1, -1):
             x = start.copy()
             x[i] += sign * h
-            e.head = Head(head.t_ns, x[:3], x[3:6], x[6:9], x[9:], head.R_LB, head.cov)
+            e.head = Head(head.t_ns, x[:3], x[3:6], x[6:9], x[9:], head.R_LB, head.cov, head.common)
             sides.append(e.predict(t)[0])
         J[:, i] = (sides[0] - sides[1]) / (2 * h)
     from_head = J @ head.cov @ J.T

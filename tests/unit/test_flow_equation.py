@@ -5,9 +5,11 @@ import numpy as np
 from velod.geometry.camera import motion_field_rows
 from velod.geometry.so3 import exp
 from velod.optimizer.flow_equation import (
+    COMMON,
     Measured,
     Rows,
     body_rows,
+    common,
     compress,
     on_error,
     on_velocity,
@@ -62,13 +64,14 @@ def test_the_same_seed_gives_the_same_bits():
     assert np.array_equal(solve(rows, 64, 9).e, solve(rows, 64, 9).e)
 
 
-def test_compression_loses_nothing_of_velocity_and_bias():
+def test_compression_loses_nothing_of_velocity_bias_and_common_errors():
     """The bins add up to the normal equations of all rows, when the gyroscope is perfect."""
     rng = np.random.default_rng(8)
     rows = rows_of(np.array([2.0, -1.0, 1.0]), np.array([0.02, 0.01, -0.03]), rng)
     fit = solve(rows, 64, 1)
-    infos = compress(rows, fit, bin_ns=5_000_000, gyro_noise=1e-9, shared_error=1.0)
-    J = np.hstack([rows.a, -rows.b]) * (np.sqrt(fit.weight) / rows.sigma / fit.scale)[:, None]
+    c = rng.normal(size=(len(rows.z), 3)) * 50
+    infos = compress(rows, c, fit, bin_ns=5_000_000, gyro_noise=1e-9, shared_error=1.0)
+    J = np.hstack([rows.a, -rows.b, c]) * (np.sqrt(fit.weight) / rows.sigma / fit.scale)[:, None]
     assert len(infos) == 4
     assert np.allclose(sum(i.L for i in infos), J.T @ J, rtol=1e-6, atol=1e-6)
     assert all(np.min(rows.t_ns) <= i.t_ns <= np.max(rows.t_ns) for i in infos)
@@ -79,13 +82,14 @@ def test_the_gyroscopes_noise_is_marginalised_as_dense_algebra_does():
     rows = rows_of(np.ones(3), np.zeros(3), rng)
     one_bin = Rows(rows.t_ns % 5_000_000, rows.z, rows.a, rows.b, rows.sigma)
     fit = solve(one_bin, 64, 1)
-    (info,) = compress(one_bin, fit, 5_000_000, gyro_noise=1.86e-3, shared_error=5.0)
+    c = rng.normal(size=(len(rows.z), 3)) * 50
+    (info,) = compress(one_bin, c, fit, 5_000_000, gyro_noise=1.86e-3, shared_error=5.0)
     # dense: z = [a, -b] x - b n_w + noise: correlated noise of all rows
     w = fit.weight > 0
     W_inv = np.diag(((rows.sigma * fit.scale) ** 2 / np.maximum(fit.weight, 1e-300) * 5.0)[w])
     b = rows.b[w]
     covariance = W_inv + b @ b.T * 1.86e-3**2 / 5e-3
-    J = np.hstack([rows.a, -rows.b])[w]
+    J = np.hstack([rows.a, -rows.b, c])[w]
     assert np.allclose(info.L, J.T @ np.linalg.solve(covariance, J), rtol=1e-5, atol=1e-6)
     assert np.allclose(info.eta, J.T @ np.linalg.solve(covariance, rows.z[w]), rtol=1e-5, atol=1e-5)
 
@@ -178,3 +182,22 @@ def test_rows_on_the_error_of_the_integrated_velocity_say_the_same():
     error = on_error(rows, R_LB, s_L)
     v_B = np.einsum("kji,kj->ki", R_LB, s_L + e)
     assert np.allclose(error.z - np.sum(error.a * e, axis=1), rows.z - np.sum(a_B * v_B, axis=1))
+
+
+def test_the_rows_of_common_errors_are_central_differences():
+    """Speeds (1 + scale) [translation (1 + depth scale) + rotation] of a moment that is earlier by the delay."""
+    t = np.linspace(0.0, 1.0, 20)
+
+    def parts(t):
+        return 40.0 * np.sin(3.0 * t), 300.0 * np.cos(2.0 * t)
+
+    def flow(scale, delay, depth_scale):
+        translational, rotational = parts(t - delay)
+        return (1.0 + scale) * (translational * (1.0 + depth_scale) + rotational)
+
+    h = 1e-6
+    rate = (sum(parts(t + h)) - sum(parts(t - h))) / (2 * h)
+    rows = common(*parts(t), rate)
+    for k in range(len(COMMON)):
+        d = np.eye(3)[k] * h
+        assert np.allclose(rows[:, k], (flow(*d) - flow(*-d)) / (2 * h), rtol=1e-6, atol=1e-4), COMMON[k]

@@ -1,9 +1,11 @@
 """The optimizer as a stage: what comes out, in which order, and what it says of itself."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from tests.synthetic import CALIBRATION, FLIGHT, REST, SPIN, Braking, Motion, errors, messages, renumber
+from tests.synthetic import CALIBRATION, FLIGHT, REST, SPIN, Braking, Motion, Shaking, errors, messages, renumber
 from velod.config import from_tree
 from velod.optimizer.stage import OptimizerStage
 from velod.types import DepthBatch, FlowBatch, ImuSamples, Velocity
@@ -38,6 +40,30 @@ def test_a_flight_is_recovered_without_any_initial_value(spline):
 def test_a_fast_spin_is_recovered_by_the_spline_on_the_error():
     velocities, _ = run(messages(SPIN, 1.0))
     assert errors(velocities, SPIN).mean() < 0.08
+
+
+def late(stream, delay_ns):
+    """The stream with its events stamped later by ``delay_ns``."""
+    for m in stream:
+        yield m if isinstance(m, ImuSamples) else replace(m, t_ns=m.t_ns + delay_ns)
+
+
+def test_a_delay_of_the_events_is_found_and_costs_little():
+    motion = Shaking(np.array([0.5, 3.0, -1.0]), FLIGHT.v0_W, FLIGHT.amplitude, FLIGHT.rate)
+    stream = list(late(messages(motion, 1.2), 2_000_000))
+    found, stage = run(stream, delay_sigma_ms=2.0)
+    ignored, _ = run(stream, delay_sigma_ms=1e-3)
+    assert abs(stage._estimator.head.common[1] - 2e-3) < 8e-4
+    assert errors(found, motion).mean() < 0.6 * errors(ignored, motion).mean()
+
+
+def test_flows_that_are_all_too_slow_cost_little_in_a_spin():
+    slow = [
+        replace(m, speed=m.speed * np.float32(0.99)) if isinstance(m, FlowBatch) else m for m in messages(SPIN, 1.0)
+    ]
+    found, _ = run(slow, flow_scale_sigma=0.01)
+    ignored, _ = run(slow, flow_scale_sigma=1e-6)
+    assert errors(found, SPIN).mean() < 0.6 * errors(ignored, SPIN).mean()
 
 
 def test_the_covariance_covers_the_error():

@@ -10,14 +10,16 @@ import numpy as np
 from velod.config import Settings
 from velod.geometry.calibration import Calibration
 from velod.geometry.rectify import rectify
+from velod.geometry.so3 import log
 from velod.optimizer import attitude, flow_equation, inertial_residual
 from velod.optimizer.attitude import Attitude
 from velod.optimizer.flow_equation import Fit, Measured, Rows
 from velod.optimizer.inertial import InertialMemory
 from velod.optimizer.preintegration import Preintegration, preintegrate
+from velod.optimizer.spline import locate
 from velod.optimizer.standstill import QUIET_NS, Standstill
 from velod.optimizer.window import Window
-from velod.types import F64, NS_PER_S, DepthBatch, FlowBatch, ImuSamples
+from velod.types import F64, I64, NS_PER_S, DepthBatch, FlowBatch, ImuSamples
 
 BIN_NS = 5_000_000
 """Flows this close in time share one gyroscope noise (DESIGN 5, item 6)."""
@@ -29,6 +31,8 @@ STANDSTILL_SIGMA = 0.05
 """m/s, of a velocity observed as zero at the end of one batch."""
 MAX_INTEGRATED = 1000.0
 """m/s; s_L, which gravity makes grow without end, is counted anew beyond this."""
+ACCELERATION_NS = 15_000_000
+"""Accelerations are differences over this time: as short as the gyroscope's noise allows."""
 MAX_CARRIED = 32
 """Predictions of one head that are remembered: a batch asks for some of them twice."""
 MAX_DIRECTION_SIGMA = 0.5
@@ -46,6 +50,7 @@ class Head:
     g_L: F64
     R_LB: F64
     cov: F64
+    common: F64  # (3,) common errors of the flows, flow_equation.COMMON
 
     @property
     def gravity_direction_sigma(self) -> float:
@@ -54,6 +59,16 @@ class Head:
         n, cov = self.g_L / norm, self.cov[9:, 9:]
         # the trace of the covariance across n
         return math.sqrt(max(float(np.trace(cov) - n @ cov @ n), 0.0)) / norm
+
+
+@dataclass(frozen=True, slots=True)
+class Equations:
+    """The flow equation of a batch: its rows on the spline and on e, and what belongs to them."""
+
+    on_spline: Rows
+    on_error: Rows
+    measured: Measured
+    common: F64  # (m, 3), flow_equation.COMMON
 
 
 class Estimator:
@@ -75,7 +90,9 @@ class Estimator:
 
     def _forget(self) -> None:
         """Nothing is known of the velocity."""
-        self.window = Window(self._imu, self._knot_ns, self._segments, SMOOTHNESS[self._o.spline])
+        o = self._o
+        common_sigma = np.array([o.flow_scale_sigma, o.delay_sigma_ms * 1e-3, o.depth_scale_sigma])
+        self.window = Window(self._imu, self._knot_ns, self._segments, SMOOTHNESS[o.spline], common_sigma)
         self.head: Head | None = None
         self.batches = 0  # that gave a velocity
         self.last_usable_t_ns = 0
@@ -94,18 +111,18 @@ class Estimator:
         if not self.window.empty and not self.memory.covers(self._preintegrated_to, flow.t_ns):
             self._count("estimate.restart_after_hole")
             self._forget()
-        rows = self._rows(flow, depth)
+        equations = self._equations(flow, depth)
         still = self._o.zero_velocity and self._standstill.detected(flow, self.memory, self._biases()[1])
         if self.window.empty:
-            if rows is None and not still:
+            if equations is None and not still:
                 return
-            self._start(flow.t_ns - QUIET_NS if rows is None else int(rows[0].t_ns.min()))
+            self._start(flow.t_ns - QUIET_NS if equations is None else int(equations.on_error.t_ns.min()))
         late = self.head is not None and flow.t_ns <= self.head.t_ns
         predicted = None if late or self.head is None else self.predict(flow.t_ns)
         if not late:
             self._extend_to(flow.t_ns)
-        if rows is not None:
-            self._add_flow(flow.t_ns, *rows, predicted)
+        if equations is not None:
+            self._add_flow(flow.t_ns, equations, predicted)
         elif still and not late:
             self._add_standstill(flow.t_ns)
         self._solve_head(self.head.t_ns if late and self.head is not None else flow.t_ns)
@@ -147,6 +164,26 @@ class Estimator:
         m = self.memory
         return preintegrate(m.t_ns, m.accel, m.gyro, t_i, t_j, b_a, b_w, self._imu.accel_noise, self._imu.gyro_noise)
 
+    def _common(self, on_velocity: Rows, on_error: Rows, measured: Measured) -> F64:
+        """Rows (m, 3) of the errors that all flows have in common; 0 before anything is known of the velocity.
+
+        Velocity and gravity are those of the head, angular velocity and accelerations those shortly before the rows.
+        """
+        head, before = self.head, int(on_error.t_ns.min()) - np.array([2, 1, 0]) * ACCELERATION_NS
+        if head is None or before[0] < self.memory.t_ns[0]:
+            return np.zeros((len(on_error.z), 3))
+        translational = (
+            measured.translational - on_error.z + np.sum(on_error.a * self._e(on_error.t_ns, head), axis=1)
+        )
+        R, s_L, _ = self.memory.at(before)
+        dt = ACCELERATION_NS * 1e-9
+        turned = log(R[0].T @ R[1]), log(R[1].T @ R[2])
+        e = self._e(before, head)
+        v_dot_B = (R[2].T @ (s_L[2] + e[2]) - R[0].T @ (s_L[0] + e[0])) / (2.0 * dt)
+        w_B, w_dot_B = (turned[0] + turned[1]) / (2.0 * dt), (turned[1] - turned[0]) / dt**2
+        b, a = on_velocity.b, on_velocity.a
+        return flow_equation.common(translational, b @ w_B, a @ v_dot_B + b @ w_dot_B)
+
     def _frame(self, t_ns: int) -> tuple[F64, F64, F64]:
         """R_LB and the affine map from spline to body velocity at ``t_ns``: v_B = N + M spline(t)."""
         R, s, _ = self.memory.at(np.array([t_ns]))
@@ -155,8 +192,8 @@ class Estimator:
         M = np.ascontiguousarray(R[0].T)
         return R[0], M @ s[0], M
 
-    def _rows(self, flow: FlowBatch, depth: DepthBatch) -> tuple[Rows, Rows, Measured] | None:
-        """Rows of the flow equation where flow and depth speak of the same event: on the spline, and on e."""
+    def _equations(self, flow: FlowBatch, depth: DepthBatch) -> Equations | None:
+        """Of the events of which both flow and depth speak; None where they are too few."""
         at_flow, at_depth = flow_equation.pairs(flow.index, depth.index)
         t = flow.t_ns - flow.age[at_flow].astype(np.int64)
         inside = (t >= self.memory.t_ns[0]) & (self.window.empty | (t >= self.window.first * self._knot_ns))
@@ -176,15 +213,25 @@ class Estimator:
             speed, flow.sigma[at_flow].astype(np.float64), on_velocity.z.copy(), depth.sigma[at_depth] / inv_depth
         )
         on_error = flow_equation.on_error(on_velocity, R_LB, s_L)
-        return on_error if self._o.spline == "error" else on_velocity, on_error, measured
+        common = self._common(on_velocity, on_error, measured)
+        return Equations(on_error if self._o.spline == "error" else on_velocity, on_error, measured, common)
 
-    def _fit(self, t_ns: int, on_error: Rows, measured: Measured) -> Fit | None:
+    def _e(self, t_ns: I64, head: Head) -> F64:
+        """e (m, 3) at ``t_ns`` (m,), from the head on along the slope of gravity."""
+        _, s_L, _ = self.memory.at(np.array([head.t_ns]))
+        e: F64 = head.R_LB @ head.v_B - s_L[0] - head.g_L * ((t_ns - head.t_ns) * 1e-9)[:, None]
+        return e
+
+    def _fit(self, t_ns: int, equations: Equations) -> Fit | None:
         """The batch's own solution for e at ``t_ns``: gravity, which e holds, is taken from what is known of it.
 
         The sigmas of the rows are set on the way.
         """
+        on_error, measured = equations.on_error, equations.measured
         dt = (on_error.t_ns - t_ns) * 1e-9
         still = replace(on_error, z=on_error.z + (on_error.a @ self._gravity()) * dt)
+        if self.head is not None:
+            still.z[:] -= equations.common @ self.head.common
         iterations, seed = self._o.ransac_iterations, self._o.seed + t_ns // 1000
         if self._o.weights == "fixed":
             still.sigma[:] = self._o.fixed_sigma_px_s
@@ -229,10 +276,8 @@ class Estimator:
         blocks, r, information = inertial_residual.linearise(p, R_LBi, (N_i, M_i), (N_j, M_j), v_j)
         return self.window.between(t_i, t_j, blocks), r, information
 
-    def _add_flow(
-        self, t_ns: int, rows: Rows, on_error: Rows, measured: Measured, predicted: tuple[F64, F64] | None
-    ) -> None:
-        fit = self._fit(t_ns, on_error, measured)
+    def _add_flow(self, t_ns: int, equations: Equations, predicted: tuple[F64, F64] | None) -> None:
+        fit = self._fit(t_ns, equations)
         if fit is None:
             self._count("fit.undetermined")
             return
@@ -241,7 +286,8 @@ class Estimator:
             shared *= max(1.0, self._innovation(t_ns, fit, predicted) / INNOVATION_GATE)
         if shared > self._o.shared_error:
             self._count("fit.inconsistent")
-        for info in flow_equation.compress(rows, fit, BIN_NS, self._imu.gyro_noise, shared):
+        rows, common = equations.on_spline, equations.common
+        for info in flow_equation.compress(rows, common, fit, BIN_NS, self._imu.gyro_noise, shared):
             self.window.add_information(info.t_ns, info.L, info.eta)
         self.batches += 1
         self.last_usable_t_ns = max(self.last_usable_t_ns, t_ns)
@@ -284,4 +330,5 @@ class Estimator:
         T = np.eye(12)
         T[:3, :3] = M
         cov = T @ solution.cov(F) @ T.T
-        self.head = Head(t_ns, N + M @ x[:3], x[3:6], x[6:9], x[9:12], R_LB, cov)
+        common = solution.x[self.window.common_columns(locate(t_ns, self._knot_ns)[0])]
+        self.head = Head(t_ns, N + M @ x[:3], x[3:6], x[6:9], x[9:12], R_LB, cov, common)

@@ -22,6 +22,9 @@ from velod.types import F32, F64, I64, U16
 
 PREDICTED_SHARE = (0.3, 3.0)
 """Bounds on predicted over measured flow where a sigma is scaled by it."""
+COMMON = ("flow scale", "delay", "depth scale")
+"""What all flows of a moment have wrong in common: speeds too large by a share, stamps too late by so many seconds,
+inverse depths too large by a share. They last: the window estimates them beside the velocity."""
 MODEL_SIGMA_PX_S = 2.0
 """Flow error that neither fit nor depth accounts for (DESIGN 5.5)."""
 
@@ -60,11 +63,11 @@ class Fit:
 
 @dataclass(frozen=True, slots=True)
 class Information:
-    """Of [e, b_w] at one moment: x^T L x / 2 - eta^T x."""
+    """Of [e, b_w, common errors] at one moment: x^T L x / 2 - eta^T x."""
 
     t_ns: int
-    L: F64  # (6, 6)
-    eta: F64  # (6,)
+    L: F64  # (9, 9)
+    eta: F64  # (9,)
 
 
 def body_rows(
@@ -96,6 +99,14 @@ def sigmas(measured: Measured, residual: F64) -> F64:
     from_fit = measured.sigma * predicted_share
     from_depth = (measured.translational - residual) * measured.depth_share
     return np.sqrt(from_fit**2 + MODEL_SIGMA_PX_S**2 + from_depth**2)
+
+
+def common(translational: F64, rotational: F64, rate: F64) -> F64:
+    """Rows (m, 3) of COMMON in z, from the predicted flow (its two parts, px/s) and its rate of change (px/s^2).
+
+    None of them may come from the noise that is in z: a product of both would look like a common error.
+    """
+    return np.column_stack([translational + rotational, -rate, translational])
 
 
 def on_velocity(t_ns: I64, speed: F64, a_B: F64, b_B: F64, w_B: F64) -> Rows:
@@ -147,23 +158,24 @@ def solve_weighted(rows: Rows, measured: Measured, iterations: int, seed: int) -
     return solve(rows, iterations, seed)
 
 
-def compress(rows: Rows, fit: Fit, bin_ns: int, gyro_noise: float, shared_error: float) -> list[Information]:
+def compress(rows: Rows, c: F64, fit: Fit, bin_ns: int, gyro_noise: float, shared_error: float) -> list[Information]:
     """The rows of each ``bin_ns`` as one Information, the gyroscope's noise of the moment marginalised out.
 
     That noise moves all flows of a moment together: a nuisance n_w of variance gyro_noise^2 / bin, which enters as
-    b_w does. ``shared_error`` divides the information of the flows, for errors they share within a batch.
+    b_w does. ``c`` (m, 3) are the rows of ``common``. ``shared_error`` divides the information of the flows, for
+    errors that they share within a batch.
     """
     first = int(rows.t_ns.min()) // bin_ns
     count = int(rows.t_ns.max()) // bin_ns - first + 1
     L, eta, total, t_ns = (
-        np.zeros((count, 6, 6)),
-        np.zeros((count, 6)),
+        np.zeros((count, 9, 9)),
+        np.zeros((count, 9)),
         np.zeros((count, 2)),
         np.empty(count, np.int64),
     )
     noise_information = bin_ns * 1e-9 / gyro_noise**2
     _compress(
-        rows.t_ns, rows.z, rows.a, rows.b, rows.sigma, fit.weight, fit.scale**2 * shared_error,
+        rows.t_ns, rows.z, rows.a, rows.b, c, rows.sigma, fit.weight, fit.scale**2 * shared_error,
         first, bin_ns, noise_information, total, t_ns, L, eta,
     )  # fmt: skip
     return [Information(int(t_ns[k]), L[k], eta[k]) for k in range(count) if total[k, 0] > 0.0]
@@ -215,6 +227,7 @@ def _compress(
     z: F64,
     a: F64,
     b: F64,
+    c: F64,
     sigma: F64,
     weight: F64,
     variance: float,
@@ -227,7 +240,7 @@ def _compress(
     eta: F64,
 ) -> None:
     """Per bin: weights and weighted times into ``total``, their mean time, and L and eta without the nuisance."""
-    row = np.empty(6)
+    row = np.empty(9)
     for k in range(z.size):
         if not weight[k] > 0.0:
             continue
@@ -236,11 +249,11 @@ def _compress(
         total[at, 0] += w
         total[at, 1] += w * (t_ns[k] - (at + first) * bin_ns)
         for i in range(3):
-            row[i], row[3 + i] = a[k, i], -b[k, i]
-        for i in range(6):
+            row[i], row[3 + i], row[6 + i] = a[k, i], -b[k, i], c[k, i]
+        for i in range(9):
             wi = w * row[i]
             eta[at, i] += wi * z[k]
-            for j in range(i, 6):
+            for j in range(i, 9):
                 L[at, i, j] += wi * row[j]
     for at in range(len(total)):
         if total[at, 0] > 0.0:
@@ -252,26 +265,26 @@ def _compress(
 def _marginalise_nuisance(L: F64, eta: F64, noise_information: float) -> None:
     """L - K S^-1 K^T and eta - K S^-1 eta_b, with K the columns of b_w and S their block plus the noise's.
 
-    ``L`` (6, 6) comes as its upper triangle and leaves whole. S is factorised C C^T; G = C^-1 [K^T, eta_b].
+    ``L`` (9, 9) comes as its upper triangle and leaves whole. S is factorised C C^T; G = C^-1 [K^T, eta_b].
     """
-    for i in range(6):
+    for i in range(9):
         for j in range(i):
             L[i, j] = L[j, i]
-    C, G = np.zeros((3, 3)), np.empty((3, 7))
+    C, G = np.zeros((3, 3)), np.empty((3, 10))
     for i in range(3):
         for j in range(i + 1):
             s = L[3 + i, 3 + j] + (noise_information if i == j else 0.0)
             for q in range(j):
                 s -= C[i, q] * C[j, q]
             C[i, j] = math.sqrt(s) if i == j else s / C[j, j]
-        for c in range(7):
-            g = L[3 + i, c] if c < 6 else eta[3 + i]
+        for c in range(10):
+            g = L[3 + i, c] if c < 9 else eta[3 + i]
             for q in range(i):
                 g -= C[i, q] * G[q, c]
             G[i, c] = g / C[i, i]
-    for i in range(6):
-        eta[i] -= G[0, i] * G[0, 6] + G[1, i] * G[1, 6] + G[2, i] * G[2, 6]
-        for j in range(6):
+    for i in range(9):
+        eta[i] -= G[0, i] * G[0, 9] + G[1, i] * G[1, 9] + G[2, i] * G[2, 9]
+        for j in range(9):
             L[i, j] -= G[0, i] * G[0, j] + G[1, i] * G[1, j] + G[2, i] * G[2, j]
 
 

@@ -1,9 +1,10 @@
 """The sliding window: control points, biases and gravity of the last segments, in information form.
 
 States, in this order: c_k, c_{k+1}, c_{k+2}, then for every segment k its newest control point c_{k+3}, its biases
-b_a and b_w, and g_L, the specific force of gravity in the frame L at the segment (Eq. 12, with gravity beside the
-biases). All factors are linear in the states at the linearisation of their first sight, so that they add up in one
-information matrix, and leaving the window (marginalisation) is a Schur complement that loses nothing.
+b_a and b_w, g_L, the specific force of gravity in the frame L at the segment (Eq. 12, with gravity beside the
+biases), and what all flows of the moment have wrong in common (``flow_equation.COMMON``). All factors are linear in
+the states at the linearisation of their first sight, so that they add up in one information matrix, and leaving the
+window (marginalisation) is a Schur complement that loses nothing.
 """
 
 from __future__ import annotations
@@ -18,8 +19,8 @@ from velod.geometry.so3 import hat
 from velod.optimizer.spline import basis, locate
 from velod.types import F64, I64
 
-BLOCK = 12
-"""States of one segment: control point, b_a, b_w, g_L."""
+BLOCK = 15
+"""States of one segment: control point, b_a, b_w, g_L, common errors of the flows."""
 HEAD = 9
 """The three control points before the first segment's own."""
 UNKNOWN_VELOCITY = 100.0
@@ -29,7 +30,9 @@ NORM_SIGMA = 0.02
 
 _GONE = np.concatenate([np.arange(3), HEAD + np.arange(3, BLOCK)])
 """Columns of what leaves with the oldest segment: its first control point, its biases and its gravity."""
-_SELECTED = np.arange(3, BLOCK)
+_SELECTED = np.arange(3, 12)
+COMMON_S = np.array([1.0, 1.0, 100.0])
+"""How long common errors last, s: flow and depth scale change with the scene, the delay hardly does."""
 
 
 class Solution:
@@ -50,8 +53,12 @@ class Solution:
 class Window:
     """Information over the segments ``first`` .. ``last``."""
 
-    def __init__(self, imu: ImuSettings, knot_ns: int, segments: int, smoothness: float) -> None:
-        """``smoothness``: sigma of the second difference of control points, m/s; weak, so that none is free."""
+    def __init__(self, imu: ImuSettings, knot_ns: int, segments: int, smoothness: float, common_sigma: F64) -> None:
+        """``smoothness``: sigma of the second difference of control points, m/s; weak, so that none is free.
+
+        ``common_sigma`` (3,): of the common errors of the flows.
+        """
+        self._common_sigma = common_sigma
         self._imu = imu
         self._knot_ns = knot_ns
         self._segments = segments
@@ -91,6 +98,8 @@ class Window:
         self._H[b, b] = 1.0 / sigma**2
         g = self.gravity_columns(self.last)
         self._H[g, g] = 1.0 / self._imu.gravity**2
+        c = self.common_columns(self.last)
+        self._H[c, c] = 1.0 / self._common_sigma**2
         self._smooth_newest()
 
     def extend(self, D_L: F64, g_L: F64, b_w: F64, dt: float) -> None:
@@ -114,6 +123,7 @@ class Window:
         J[:, old_b[3:]] = turn
         noise = hat(g_L) @ hat(g_L).T * self._imu.gyro_noise**2 * dt + np.eye(3) * 1e-8
         self.add(J, turn @ b_w, np.asarray(np.linalg.inv(noise)))
+        self._carry_common(dt)
         self._smooth_newest()
 
     def control_columns(self, segment: int) -> list[int]:
@@ -129,6 +139,10 @@ class Window:
     def gravity_columns(self, segment: int) -> np.ndarray:
         """Columns of g_L of a segment, (3,)."""
         return HEAD + BLOCK * (segment - self.first) + 9 + np.arange(3)
+
+    def common_columns(self, segment: int) -> np.ndarray:
+        """Columns of the common errors of a segment, (3,)."""
+        return HEAD + BLOCK * (segment - self.first) + 12 + np.arange(3)
 
     def spline_row(self, t_ns: int) -> F64:
         """F (3, n) with F x = the spline at ``t_ns`` (Eq. 7)."""
@@ -164,10 +178,10 @@ class Window:
         _add_factor(self._H, self._h, self._end, J, r, information)
 
     def add_information(self, t_ns: int, L: F64, eta: F64) -> None:
-        """Information (6, 6) of [spline, b_w] at ``t_ns``."""
+        """Information (9, 9) of [spline, b_w, common errors] at ``t_ns``."""
         segment, u = locate(t_ns, self._knot_ns)
-        bias = HEAD + BLOCK * (segment - self.first) + 6
-        columns = np.array([*self.control_columns(segment), bias])
+        own = HEAD + BLOCK * (segment - self.first)
+        columns = np.array([*self.control_columns(segment), own + 6, own + 12])
         _add_information(self._H, self._h, self._end, columns, basis(u), L, eta)
 
     def shift(self, offset: F64) -> None:
@@ -195,13 +209,22 @@ class Window:
         if g_prior is not None:
             direction = g_prior / np.linalg.norm(g_prior)
             sigma = NORM_SIGMA + self._imu.gravity * g_sigma**2
-            g = slice(n - 3, n)
+            at = int(self.gravity_columns(self.last)[0])
+            g = slice(at, at + 3)
             U[g, g] += np.outer(direction, direction) / sigma**2
             x[g] += direction * self._imu.gravity / sigma**2
         if not _factorise(U, last, n):
             raise np.linalg.LinAlgError("the information of the window is not positive definite")
         _substitute(U, last, x)
         return Solution(x, U, last)
+
+    def _carry_common(self, dt: float) -> None:
+        """The common errors of the newest segment are those of the one before, ``dt`` s earlier, less and less."""
+        kept = np.exp(-dt / COMMON_S)
+        J = np.zeros((3, self.size))
+        J[np.arange(3), self.common_columns(self.last)] = 1.0
+        J[np.arange(3), self.common_columns(self.last - 1)] = -kept
+        self.add(J, np.zeros(3), np.diag(1.0 / (self._common_sigma**2 * (1.0 - kept**2))))
 
     def _smooth_newest(self) -> None:
         """The newest control point continues the line through the two before, weakly."""
@@ -275,15 +298,15 @@ def _add_factor(H: F64, h: F64, end: I64, J: F64, r: F64, information: F64) -> N
 
 @njit(cache=True, nogil=True)
 def _add_information(H: F64, h: F64, end: I64, columns: I64, weights: F64, L: F64, eta: F64) -> None:
-    """L (6, 6), eta (6,) of [sum of weights * control points, b_w]; ``columns`` (5,): the four points, then b_w."""
-    for a in range(5):
-        wa, la = (weights[a], 0) if a < 4 else (1.0, 3)
+    """L (9, 9), eta (9,) of [sum of weights * control points, b_w, common]; ``columns`` (6,): points, b_w, common."""
+    for a in range(6):
+        wa, la = (weights[a], 0) if a < 4 else (1.0, 3 * (a - 3))
         for i in range(3):
             row = columns[a] + i
-            end[row] = max(end[row], columns[4] + 3)
+            end[row] = max(end[row], columns[5] + 3)
             h[row] += wa * eta[la + i]
-            for b in range(5):
-                w, lb = (wa * weights[b], 0) if b < 4 else (wa, 3)
+            for b in range(6):
+                w, lb = (wa * weights[b], 0) if b < 4 else (wa, 3 * (b - 3))
                 for j in range(3):
                     H[row, columns[b] + j] += w * L[la + i, lb + j]
 
