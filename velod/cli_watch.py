@@ -139,6 +139,8 @@ def _lines(worker: str, received: Received | None, alive: bool) -> list[str]:
     stale = (time.time_ns() - received.t_received_ns) * 1e-9 > HEALTH.stale_after_s
     # The supervisor and drivers hold no token; for them recent health is life enough.
     state = "stale" if stale else "up" if alive or h.stage not in ("ingest", "flow", "depth", "optimizer") else "gone"
+    if state == "up" and h.role:
+        state = h.role
     name, p50, p99 = _main_latency(h)
     gaps, drops = losses(h.counters)
     line = (

@@ -27,6 +27,9 @@ from velod.wire.topics import ALIVE, DEPTH, DONE, FLOW, VELOCITY, Topic, key, pa
 LOCAL = "tcp/127.0.0.1:17447"
 """Where a velod with default settings is found from its own host."""
 
+CLOCK_RESTART_NS = 10_000_000_000
+"""So far back in time the sensor's clock was set anew; what is less far back has been before."""
+
 _POLL_S = 0.5
 # Several workers publish on these keys, and batches overtake each other.
 _OVERTAKING = {FLOW.name: 16, DEPTH.name: 16, DONE.name: 16}
@@ -138,9 +141,11 @@ class Listener:
 class VelocityClient:
     """The stream of velocities of one rig.
 
-    A context manager and an endless iterable of valid velocities (``valid_only=False``: of all). Reconnects by
-    itself. Velocities older than ``max_age_s`` at arrival are discarded and counted as ``stale``, invalid ones as
-    ``invalid``; across hosts the age needs synchronised clocks, ``math.inf`` keeps everything.
+    A context manager and an endless iterable of valid velocities (``valid_only=False``: of all), in order of sensor
+    time. Reconnects by itself. Velocities older than ``max_age_s`` when they are handed out are discarded and counted
+    as ``stale``, invalid ones as ``invalid``, and those of a time that was handed out already as ``repeated`` (a
+    stand-by that takes over may repeat one). Across hosts the age needs synchronised clocks; ``math.inf`` keeps
+    everything.
     """
 
     def __init__(
@@ -150,6 +155,7 @@ class VelocityClient:
         self._max_age_s = max_age_s
         self._valid_only = valid_only
         self._discarded: dict[str, int] = {}
+        self._t_ns = -CLOCK_RESTART_NS  # sensor time of the newest one handed out
 
     def __enter__(self) -> Self:
         """Raises velod.runtime.session.SessionError where the endpoint is malformed."""
@@ -172,11 +178,16 @@ class VelocityClient:
             velocity = received.envelope.message
             # The age when it is handed out, not when it came in: it may have waited in the queue.
             age_s = (time.time_ns() - received.envelope.t_pub_ns) * 1e-9
+            if not isinstance(velocity, Velocity):
+                continue
             if age_s > self._max_age_s:
                 self._discard("stale")
-            elif self._valid_only and isinstance(velocity, Velocity) and not velocity.valid:
+            elif self._t_ns - CLOCK_RESTART_NS < velocity.t_ns <= self._t_ns:
+                self._discard("repeated")
+            elif self._valid_only and not velocity.valid:
                 self._discard("invalid")
-            elif isinstance(velocity, Velocity):
+            else:
+                self._t_ns = velocity.t_ns
                 return velocity
         return None
 

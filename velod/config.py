@@ -138,6 +138,7 @@ class DepthSettings:
 
 @dataclass(frozen=True, slots=True)
 class OptimizerSettings:
+    workers: int = _f(1, "processes: one leads, the others stand by to take over within 0.1 s", lo=1, hi=8)
     output_hz: float = _f(75.0, "velocities per second of sensor time", lo=1.0, hi=1000.0)
     spline: str = _f(
         "error",

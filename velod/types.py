@@ -210,6 +210,8 @@ class Health:
     rates: dict[str, float] = field(default_factory=dict)  # per second, over the last period
     latency_ms: dict[str, float] = field(default_factory=dict)  # p50/p99 over the last period
     alarms: dict[str, str] = field(default_factory=dict)  # name -> what is wrong, while it is
+    role: str = ""  # among the processes of its stage, where that can change: "leads" | "standby"
+    gauges: dict[str, float] = field(default_factory=dict)  # values of now, unit in the name: "clock.drift_ppm"
 
 
 @dataclass(frozen=True, slots=True)

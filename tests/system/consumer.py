@@ -1,7 +1,7 @@
 """A consumer on a host of its own: ``consumer.py ENDPOINT OUT``, until SIGTERM.
 
 A line of JSON for each velocity as it came in (``raw``) and as the client handed it out (``used``), with the host
-time of that moment; in the end the client's counters.
+time of that moment; one for each word of health; in the end the client's counters.
 """
 
 from __future__ import annotations
@@ -10,13 +10,14 @@ import json
 import signal
 import sys
 import time
+from dataclasses import asdict
 from pathlib import Path
 from threading import Event, Lock, Thread
 from typing import IO, Any
 
 from velod.client import Listener, VelocityClient
-from velod.types import Velocity
-from velod.wire.topics import VELOCITY
+from velod.types import Health, Velocity
+from velod.wire.topics import HEALTH, VELOCITY
 
 
 def main() -> None:
@@ -25,7 +26,7 @@ def main() -> None:
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
     with Path(out).open("w", buffering=1) as file:
         log = _Log(file)
-        with Listener("rig0", (VELOCITY,), endpoint) as listener:
+        with Listener("rig0", (VELOCITY, HEALTH), endpoint) as listener:
             print("ready", flush=True)
             raw = Thread(target=_note_raw, args=(listener, log, stop))
             raw.start()
@@ -41,8 +42,12 @@ def main() -> None:
 def _note_raw(listener: Listener, log: _Log, stop: Event) -> None:
     while not stop.is_set():
         received = listener.receive(0.1)
-        if received is not None:
-            e = received.envelope
+        if received is None:
+            continue
+        e = received.envelope
+        if isinstance(e.message, Health):
+            log.line({"kind": "health", **asdict(e.message), "received_t_ns": received.t_received_ns})
+        elif isinstance(e.message, Velocity):
             log.write("raw", e.message, t_ns=received.t_received_ns, t_pub_ns=e.t_pub_ns, t_origin_ns=e.t_origin_ns)
 
 

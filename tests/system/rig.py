@@ -9,7 +9,8 @@ import sys
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from threading import Event, Thread
+from typing import Any, Self
 
 import numpy as np
 
@@ -31,20 +32,25 @@ class Seen:
 
     raw: list[dict[str, Any]]
     used: list[dict[str, Any]]
+    health: list[dict[str, Any]]
     counters: dict[str, int]
 
     @staticmethod
     def read(path: Path) -> Seen:
         """From the file that ``consumer.py`` wrote."""
-        rows = [json.loads(line) for line in path.read_text().splitlines()]
-        kinds: dict[str, list[dict[str, Any]]] = {"raw": [], "used": [], "end": []}
+        rows = [json.loads(line) for line in path.read_text().splitlines(keepends=True) if line.endswith("\n")]
+        kinds: dict[str, list[dict[str, Any]]] = {"raw": [], "used": [], "health": [], "end": []}
         for row in rows:
             kinds[row["kind"]].append(row)
-        return Seen(kinds["raw"], kinds["used"], kinds["end"][0]["counters"] if kinds["end"] else {})
+        return Seen(kinds["raw"], kinds["used"], kinds["health"], kinds["end"][0]["counters"] if kinds["end"] else {})
 
     def valid(self) -> list[dict[str, Any]]:
         """What was handed out as valid."""
         return [row for row in self.used if row["valid"]]
+
+    def newest_health(self) -> dict[str, dict[str, Any]]:
+        """Of each process, by worker."""
+        return {row["worker"]: row for row in self.health}
 
     def longest_gap_s(self) -> float:
         """Between two valid velocities handed out."""
@@ -71,6 +77,31 @@ class Seen:
     def travel_ms(self) -> np.ndarray:
         """Published -> arrived, ms; the hosts of a test share one clock."""
         return np.array([(row["t_ns"] - row["t_pub_ns"]) * 1e-6 for row in self.raw])
+
+
+class Stalls:
+    """How long this machine keeps a process from running, while the context lasts; next to nothing on a quiet one."""
+
+    _SLEEP_S = 0.005
+
+    def __init__(self) -> None:
+        self.longest_s = 0.0
+        self._stop = Event()
+        self._thread = Thread(target=self._watch, daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join()
+
+    def _watch(self) -> None:
+        while not self._stop.is_set():
+            before_s = time.monotonic()
+            time.sleep(self._SLEEP_S)
+            self.longest_s = max(self.longest_s, time.monotonic() - before_s - self._SLEEP_S)
 
 
 @dataclass(slots=True)
@@ -139,6 +170,10 @@ class Rig:
         """End a consumer and read what it saw."""
         consumer.send_signal(signal.SIGTERM)
         consumer.wait(10.0)
+        return self.seen_so_far(name)
+
+    def seen_so_far(self, name: str = "consumer") -> Seen:
+        """What a consumer has seen until now."""
         return Seen.read(self.directory / f"{name}.jsonl")
 
     def velod(self, host: str, *arguments: str) -> str:
@@ -163,6 +198,13 @@ class Rig:
         """Start any process; its log goes to ``name``.log."""
         with (self.directory / f"{name}.log").open("w") as log:
             return host.start(command, stderr=log, **options)
+
+    def wait_for_velocities(self, n: int, name: str = "consumer", timeout_s: float = 30.0) -> None:
+        """Until a consumer has been handed so many."""
+        path, deadline_s = self.directory / f"{name}.jsonl", time.monotonic() + timeout_s
+        while path.read_text().count('"used"') < n:
+            assert time.monotonic() < deadline_s, f"{name} has not seen {n} velocities"
+            time.sleep(0.02)
 
     def _velod(self, host: Host, name: str, *arguments: str, **options: Any) -> subprocess.Popen[str]:
         return self.start(host, name, [sys.executable, "-P", "-m", "velod.cli", *arguments], **options)

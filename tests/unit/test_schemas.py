@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import fields
+from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import get_type_hints
 
@@ -65,9 +65,9 @@ def test_a_field_that_may_be_missing_has_the_default_of_the_dataclass_and_stands
         if not f.optional:
             continue
         assert f.kind != "times"
-        default = of_class[f.name].default
+        added = of_class[f.name]
+        default = added.default if added.default_factory is MISSING else added.default_factory()
         if f.kind == "column":
-            default = of_class[f.name].default_factory()
             assert default.shape == f.shape and default.dtype == f.dtype
         np.testing.assert_array_equal(default, np.full_like(default, f.default) if f.kind == "column" else f.default)
 

@@ -9,7 +9,7 @@ from velod.runtime.outlet import Outlet
 from velod.runtime.prime import LARGE
 from velod.types import Done, EventBatch, StereoBatch
 from velod.wire import encode
-from velod.wire.topics import ALIVE, BATCH_DEPTH, BATCH_FLOW, PRIME, Topic, parts
+from velod.wire.topics import BATCH_DEPTH, BATCH_FLOW, PRIME, Topic
 
 WINDOW = 2
 """Batches a worker is sent before it has finished the first: one in work, one on its way."""
@@ -44,9 +44,8 @@ class BatchDispatch:
         if done.stage in self._dispatchers:
             self._put(done.stage, self._dispatchers[done.stage].done(done.worker, done.seq, time.monotonic()))
 
-    def alive(self, token_key: str, is_there: bool) -> None:
-        """A liveliness token came or went. Raises ValueError for a key that is none."""
-        token = parts(ALIVE, token_key)
+    def alive(self, token: dict[str, str], *, is_there: bool) -> None:
+        """A liveliness token, by its key's parts, came or went."""
         dispatcher = self._dispatchers.get(token["stage"])
         if dispatcher is not None:
             if is_there:

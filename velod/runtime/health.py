@@ -40,7 +40,7 @@ class HealthReporter:
         """Time until the next report, 0 when it is due."""
         return max(0.0, self._last_s + PERIOD_S - time.monotonic())
 
-    def report(self, t_ns: int, counters: dict[str, int], alarms: dict[str, str]) -> Health:
+    def report(self, t_ns: int, counters: dict[str, int], alarms: dict[str, str], role: str = "") -> Health:
         """Health of the period that ends now. ``t_ns``: newest sensor time seen, 0 for none."""
         now_s = time.monotonic()
         elapsed_s = max(now_s - self._last_s, 1e-3)
@@ -62,6 +62,7 @@ class HealthReporter:
             rates=rates,
             latency_ms=self._latency_ms(),
             alarms=alarms,
+            role=role,
         )
         self._seq += 1
         self._last_s, self._before = now_s, dict(counters)

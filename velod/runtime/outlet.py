@@ -30,9 +30,11 @@ class Outlet:
     receiver then stops the publisher.
     """
 
-    def __init__(self, session: zenoh.Session, rig: str, lossless: bool = False) -> None:
+    def __init__(self, session: zenoh.Session, rig: str, lossless: bool = False, author: str = "") -> None:
+        """``author``: travels beside each message, for those who publish on the same key to tell them apart."""
         self.counters: dict[str, int] = {}
         self._session, self._rig = session, rig
+        self._author = author.encode() or None
         self._congestion = zenoh.CongestionControl.BLOCK if lossless else zenoh.CongestionControl.DROP
         self._publishers: dict[tuple[str, tuple[tuple[str, str], ...]], Any] = {}
 
@@ -54,7 +56,7 @@ class Outlet:
 
     def publish_bytes(self, topic: Topic, data: bytes, **parts: str) -> None:
         """Publish what has been encoded already."""
-        self.publisher(topic, **parts).put(data)
+        self.publisher(topic, **parts).put(data, attachment=self._author)
         name = f"out.{topic.name}"
         self.counters[name] = self.counters.get(name, 0) + 1
 

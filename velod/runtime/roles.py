@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import zenoh
@@ -17,10 +17,10 @@ from velod.runtime.inbox import Item
 from velod.runtime.measure import SensorClock
 from velod.runtime.shell import WorkerShell
 from velod.runtime.stages import Limited, Stage
+from velod.runtime.succession import Succession, Turn
 from velod.types import DepthBatch, Done, EventBatch, FlowBatch, ImuSamples, Message, Odometry, StereoBatch, Velocity
-from velod.wire import Envelope
+from velod.wire import Envelope, decode
 from velod.wire.topics import (
-    ALIVE,
     BATCH_DEPTH,
     BATCH_FLOW,
     DEPTH,
@@ -37,7 +37,6 @@ from velod.wire.topics import (
 
 OVERTAKING = 64
 """Results of several workers overtake each other by no more than this."""
-_TOKENS, _CAME, _WENT = "tokens", b"came", b"went"
 
 
 class IngestShell(WorkerShell):
@@ -58,20 +57,14 @@ class IngestShell(WorkerShell):
         super().subscribe(stack)
         # Word of workers overtakes the sensor: however far ingest is behind, an idle worker gets the next batch.
         self.listen(stack, DONE, key(DONE, self.rig), urgent=True)
-        self.inbox.add_source(_TOKENS, self.depth, urgent=True)
-        callback = zenoh.handlers.Callback(self._token_changed, indirect=False)
-        tokens = self.session.liveliness().declare_subscriber(key(ALIVE, self.rig), callback, history=True)
-        stack.enter_context(tokens)
+        self.listen_to_tokens(stack)
 
-    def _token_changed(self, sample: zenoh.Sample) -> None:
-        came = sample.kind == zenoh.SampleKind.PUT
-        self.inbox.put(_TOKENS, str(sample.key_expr), _CAME if came else _WENT)
+    def token_changed(self, token: dict[str, str], *, is_there: bool) -> None:
+        """A worker came or went."""
+        self._dispatch.alive(token, is_there=is_there)
 
     def take_other(self, item: Item) -> bool:
-        """Workers that come and go, and event packets that are too old; the others come within a new budget."""
-        if item.source == _TOKENS:
-            self._dispatch.alive(item.key, item.data == _CAME)
-            return True
+        """Event packets that are too old; the others come within a new budget."""
         if item.source != EVENTS.name:
             return False
         now_s = time.monotonic()
@@ -158,11 +151,25 @@ class DepthShell(BatchShell):
     output: ClassVar[Topic] = DEPTH
 
 
+@dataclass(frozen=True, slots=True)
+class _Output:
+    """What one tick of sensor time led to, and when its inputs came about (host clock, ns)."""
+
+    velocity: Velocity
+    odometry: Odometry | None
+    cause_t_pub_ns: int
+
+
 class OptimizerShell(WorkerShell):
-    """Flow, depth and IMU in, velocities out, each with the time at which its newest batch was closed."""
+    """Flow, depth and IMU in, velocities out, each with the time at which its newest batch was closed.
+
+    Where there are several optimizers, one of them publishes, and the others stand by (``succession``).
+    """
 
     inputs: ClassVar[dict[Topic, int]] = {FLOW: OVERTAKING, DEPTH: OVERTAKING, IMU: 0}
+    poll_s: ClassVar[float] = 0.01
     _REMEMBERED = 256
+    _PEERS: ClassVar[dict[str, type]] = {VELOCITY.name: Velocity, ODOMETRY.name: Odometry}
 
     def __init__(
         self, session: zenoh.Session, settings: Settings, stage_name: str, worker: str, stage: Stage
@@ -171,9 +178,49 @@ class OptimizerShell(WorkerShell):
         self._origin_ns: dict[tuple[int, int], int] = {}  # by seq and end of the batch
         self._newest = (-1, 0)
         self._clock = SensorClock()
+        self._succession: Succession[_Output] = Succession(worker)
+        self._odometry_seq = 0
+
+    def subscribe(self, stack: ExitStack) -> None:
+        """The stage's inputs; what other optimizers publish, and their coming and going, before anything else."""
+        self.listen_to_tokens(stack, stage=self.stage_name)
+        for topic in (VELOCITY, ODOMETRY):
+            self._listen_to_peers(stack, topic)
+        super().subscribe(stack)
+
+    def _listen_to_peers(self, stack: ExitStack, topic: Topic) -> None:
+        self.inbox.add_source(topic.name, self.depth, urgent=True)
+
+        def arrived(sample: zenoh.Sample) -> None:
+            author = "" if sample.attachment is None else sample.attachment.to_string()
+            self.inbox.put(topic.name, author, sample.payload.to_bytes())
+
+        callback = zenoh.handlers.Callback(arrived, indirect=False)
+        at = key(topic, self.rig)
+        stack.enter_context(self.session.declare_subscriber(at, callback, allowed_origin=zenoh.Locality.REMOTE))
+
+    def token_changed(self, token: dict[str, str], *, is_there: bool) -> None:
+        """Another optimizer came or went."""
+        if is_there:
+            self._succession.joined(token["worker"])
+        else:
+            self._publish_turns(self._succession.left(token["worker"], time.monotonic()))
+
+    def take_other(self, item: Item) -> bool:
+        """What another optimizer has published."""
+        if item.source not in self._PEERS:
+            return False
+        message = decode(item.data, self._PEERS[item.source]).message
+        if not item.key.startswith(f"{self.stage_name}-"):
+            self.count("velocity.alien", f"a {item.source} that no optimizer of this rig has sent ({item.key!r})")
+        elif isinstance(message, Odometry):
+            self._odometry_seq = message.seq + 1
+        else:
+            self._succession.heard(item.key, message.t_ns, message.seq, time.monotonic())
+        return True
 
     def publish(self, outputs: Sequence[Message], cause: Envelope) -> None:
-        """Velocities; the first one that uses a batch tells how long the batch took from end to end."""
+        """Hand the outputs over for publication, here or by another optimizer."""
         message = cause.message
         if isinstance(message, ImuSamples):
             self._clock.heard(max(message.t_ns, message.event_t_ns), cause.t_origin_ns)
@@ -181,20 +228,41 @@ class OptimizerShell(WorkerShell):
             self._origin_ns[message.seq, message.t_ns] = cause.t_origin_ns
             if len(self._origin_ns) > self._REMEMBERED:
                 del self._origin_ns[next(iter(self._origin_ns))]
+        odometry = {o.t_ns: o for o in outputs if isinstance(o, Odometry)}
         for output in outputs:
-            if not isinstance(output, Velocity | Odometry):
-                continue
-            output = replace(output, age_ms=self._clock.age_ms(output.t_ns, time.time_ns()))
-            if isinstance(output, Odometry):
-                self.outlet.publish(ODOMETRY, output)
-                continue
-            batch = (output.batch_seq, output.batch_t_ns)
-            t_origin_ns = self._origin_ns.get(batch, 0)
-            t_pub_ns = self.outlet.publish(VELOCITY, output, t_origin_ns)
-            self.health.add_latency("stage", t_pub_ns - cause.t_pub_ns)
-            if batch != self._newest and t_origin_ns:
-                self.health.add_latency("end_to_end", t_pub_ns - t_origin_ns)
-            self._newest = batch
+            if isinstance(output, Velocity):
+                made = _Output(output, odometry.get(output.t_ns), cause.t_pub_ns)
+                self._publish_turns(self._succession.offer(output.t_ns, made, time.monotonic()))
+
+    def every_round(self) -> None:
+        """Take over where it is time to."""
+        self._publish_turns(self._succession.look(time.monotonic()))
+
+    def _publish_turns(self, turns: Sequence[Turn[_Output]]) -> None:
+        for turn in turns:
+            age_ms = self._clock.age_ms(turn.output.velocity.t_ns, time.time_ns())
+            self._publish_velocity(replace(turn.output.velocity, seq=turn.seq, age_ms=age_ms), turn.output)
+            if turn.output.odometry is not None:
+                seq, self._odometry_seq = self._odometry_seq, self._odometry_seq + 1
+                self.outlet.publish(ODOMETRY, replace(turn.output.odometry, seq=seq, age_ms=age_ms))
+
+    def _publish_velocity(self, velocity: Velocity, made: _Output) -> None:
+        """The first velocity that uses a batch tells how long the batch took from end to end."""
+        batch = (velocity.batch_seq, velocity.batch_t_ns)
+        t_origin_ns = self._origin_ns.get(batch, 0)
+        t_pub_ns = self.outlet.publish(VELOCITY, velocity, t_origin_ns)
+        self.health.add_latency("stage", t_pub_ns - made.cause_t_pub_ns)
+        if batch != self._newest and t_origin_ns:
+            self.health.add_latency("end_to_end", t_pub_ns - t_origin_ns)
+        self._newest = batch
+
+    def role(self) -> str:
+        """Leads or standby."""
+        return self._succession.role
+
+    def counters(self) -> dict[str, int]:
+        """With those of the succession."""
+        return {**super().counters(), **self._succession.counters}
 
 
 SHELLS: dict[str, type[WorkerShell]] = {

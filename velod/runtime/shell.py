@@ -24,7 +24,7 @@ from velod.runtime.outlet import Outlet
 from velod.runtime.stages import Stage, alarms_of
 from velod.types import Message
 from velod.wire import Envelope, WireError, decode
-from velod.wire.topics import ALIVE, HEALTH, Topic, key
+from velod.wire.topics import ALIVE, HEALTH, Topic, key, parts
 
 log = logging.getLogger("velod")
 
@@ -36,6 +36,7 @@ FIFO_BYTES = 64 << 20
 BEHIND = 100
 """So many waiting messages mean that the worker cannot keep up."""
 CONSUMER_WAIT_S = 2.0
+_TOKENS, _CAME, _WENT = "tokens", b"came", b"went"
 
 
 class WorkerShell:
@@ -44,6 +45,7 @@ class WorkerShell:
     inputs: ClassVar[dict[Topic, int]] = {}
     """What the stage takes, and how far messages on one key may overtake each other; -1: do not look for gaps."""
     depth: ClassVar[int] = FIFO_DEPTH
+    poll_s: ClassVar[float] = POLL_S
 
     def __init__(
         self, session: zenoh.Session, settings: Settings, stage_name: str, worker: str, stage: Stage
@@ -51,7 +53,7 @@ class WorkerShell:
         self.session, self.rig = session, settings.rig.name
         self.stage_name, self.worker, self.stage = stage_name, worker, stage
         self.inbox = Inbox()
-        self.outlet = Outlet(session, self.rig, settings.zenoh.lossless)
+        self.outlet = Outlet(session, self.rig, settings.zenoh.lossless, author=worker)
         self.health = HealthReporter(stage_name, worker)
         self._inbox_bytes = None if settings.zenoh.lossless else FIFO_BYTES
         self._topics = {t.name: t for t in self.inputs}
@@ -73,9 +75,10 @@ class WorkerShell:
             stack.enter_context(self.session.liveliness().declare_token(token))
             log.info("up")
             while not stop.is_set():
-                item = self.inbox.get(min(POLL_S, self.health.due_in_s()))
+                item = self.inbox.get(min(self.poll_s, self.health.due_in_s()))
                 if item is not None:
                     self._take(item)
+                self.every_round()
                 if self.health.due_in_s() == 0.0:
                     self.every_second()
             self.every_second()  # the last word: counters up to the end
@@ -119,9 +122,20 @@ class WorkerShell:
         behind = {} if (n := self.inbox.waiting()) < BEHIND else {"inbox.behind": f"{n} messages wait to be handled"}
         return {**alarms_of(self.stage), **silent, **behind}
 
+    def role(self) -> str:
+        """What the process is among those of its stage, where that can change."""
+        return ""
+
+    def token_changed(self, token: dict[str, str], *, is_there: bool) -> None:
+        """A liveliness token, by its key's parts, came or went; for those who ``listen_to_tokens``."""
+        raise NotImplementedError
+
+    def every_round(self) -> None:
+        """Called after each item, and at least every ``poll_s``."""
+
     def every_second(self) -> None:
         """Publish the health of the period that ends."""
-        health = self.health.report(self._t_ns, self.counters(), self.alarms())
+        health = self.health.report(self._t_ns, self.counters(), self.alarms(), self.role())
         self.outlet.publish(HEALTH, health, worker=self.worker)
 
     # What all roles use ---------------------------------------------------------------------------------------
@@ -137,6 +151,18 @@ class WorkerShell:
         callback = zenoh.handlers.Callback(arrived, indirect=False)
         stack.enter_context(self.session.declare_subscriber(at, callback))
 
+    def listen_to_tokens(self, stack: ExitStack, **parts: str) -> None:
+        """Hear of processes that come and go, those included that are there already."""
+        self.inbox.add_source(_TOKENS, FIFO_DEPTH, urgent=True)
+
+        def changed(sample: zenoh.Sample) -> None:
+            came = sample.kind == zenoh.SampleKind.PUT
+            self.inbox.put(_TOKENS, str(sample.key_expr), _CAME if came else _WENT)
+
+        callback = zenoh.handlers.Callback(changed, indirect=False)
+        tokens = self.session.liveliness().declare_subscriber(key(ALIVE, self.rig, **parts), callback, history=True)
+        stack.enter_context(tokens)
+
     def count(self, name: str, text: str = "", *, with_trace: bool = False) -> None:
         """Count by name; with a text, log it the first time that this happens."""
         self._counters[name] = self._counters.get(name, 0) + 1
@@ -150,13 +176,16 @@ class WorkerShell:
 
     def _wait_for_consumers(self, stop: Event) -> None:
         """Be alive only once what is published can arrive: a new link takes a moment to carry subscriptions."""
-        for topic, parts in self.consumers():
-            if not stop.is_set() and not self.outlet.wait_for_subscriber(topic, CONSUMER_WAIT_S, **parts):
-                log.warning("nobody listens on %s yet", key(topic, self.rig, **parts))
+        for topic, where in self.consumers():
+            if not stop.is_set() and not self.outlet.wait_for_subscriber(topic, CONSUMER_WAIT_S, **where):
+                log.warning("nobody listens on %s yet", key(topic, self.rig, **where))
 
     def _take(self, item: Item) -> None:
         """One item of the inbox, whatever it is; nothing that is wrong with it gets further than here."""
         try:
+            if item.source == _TOKENS:
+                self.token_changed(parts(ALIVE, item.key), is_there=item.data == _CAME)
+                return
             if self.take_other(item):
                 return
             topic = self._topics.get(item.source)

@@ -65,7 +65,12 @@ def alarms_of(stage: Stage) -> dict[str, str]:
 
 def worker_names(settings: Settings, stage: str) -> list[str]:
     """The workers of one stage: ``flow-0``, ``flow-1``, ..."""
-    count = {"flow": settings.flow.workers, "depth": settings.depth.workers}.get(stage, 1)
+    count = {
+        "flow": settings.flow.workers,
+        "depth": settings.depth.workers,
+        # In a lossless replay nobody may be passed over for being late.
+        "optimizer": 1 if settings.zenoh.lossless else settings.optimizer.workers,
+    }.get(stage, 1)
     return [f"{stage}-{i}" for i in range(count)]
 
 

@@ -1,0 +1,69 @@
+"""A second optimizer stands by: whatever happens to the first, consumers see one stream."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests import slanted_scene
+from tests.system.hosts import Network, why_not
+from tests.system.rig import Rig, Stalls, pid_of
+from velod.config import OptimizerSettings, Settings
+
+pytestmark = [pytest.mark.system, pytest.mark.skipif(bool(why_not()), reason=why_not())]
+
+
+SECONDS = 9.0
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Iterator[Rig]:
+    recording = slanted_scene.write(tmp_path / "slanted.h5", SECONDS)
+    with Network("compute", "consumer") as network:
+        rig = Rig(network, recording, tmp_path, replace(Settings(), optimizer=OptimizerSettings(workers=2)))
+        rig.start_service()
+        yield rig
+
+
+def leader(rig: Rig) -> str:
+    """By the health of both; asked while velocities flow."""
+    roles = {w: h["role"] for w, h in rig.seen_so_far().newest_health().items() if h["stage"] == "optimizer"}
+    assert sorted(roles.values()) == ["leads", "standby"]
+    return next(worker for worker, role in roles.items() if role == "leads")
+
+
+def test_whatever_happens_to_the_leader_consumers_see_one_stream(rig: Rig) -> None:
+    """The leader is killed; the one that took over is stopped for 1.2 s, and goes on."""
+    consumer = rig.start_consumer("consumer")
+    with Stalls() as stalls:
+        kill_one_and_stop_the_other(rig)
+    seen = rig.seen(consumer)
+    steps_ns = np.diff([row["sensor_t_ns"] for row in seen.used])
+    assert 13_000_000 < steps_ns.min() <= steps_ns.max() < 14_000_000
+    assert (np.diff([row["seq"] for row in seen.used]) == 1).all()
+    assert all(row["valid"] for row in seen.used[75:])
+    # Both the one that is late and the one that takes over may have waited for a busy machine.
+    assert seen.longest_gap_s() <= 0.1 + 2.0 * stalls.longest_s
+
+
+def kill_one_and_stop_the_other(rig: Rig) -> None:
+    player = rig.start_player("compute")
+    rig.wait_for_velocities(150)
+    first = leader(rig)
+    os.kill(pid_of(first, rig.compute), signal.SIGKILL)
+    rig.wait_for_velocities(350)
+    second = leader(rig)
+    assert second != first
+    os.kill(pid := pid_of(second, rig.compute), signal.SIGSTOP)
+    time.sleep(1.2)
+    os.kill(pid, signal.SIGCONT)
+    rig.wait_for_velocities(570)
+    assert leader(rig) == first
+    assert player.wait(60.0) == 0
