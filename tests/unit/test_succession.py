@@ -8,7 +8,7 @@ from itertools import pairwise
 from hypothesis import given
 from hypothesis import strategies as st
 
-from velod.runtime.succession import PATIENCE_S, RELINK_S, Succession, Turn
+from velod.runtime.succession import PATIENCE_S, RELINK_S, SETTLE_S, Succession, Turn
 
 TICK_NS = 13_333_333
 TICK_S = TICK_NS * 1e-9
@@ -164,3 +164,13 @@ def test_whatever_one_of_two_does_the_other_makes_it_one_stream(spans: list[tupl
     assert list(ticks) == list(range(len(ticks)))
     assert list(numbers) == list(range(len(ticks)))
     assert max(b - a for a, b in pairwise(at_ms)) <= 100
+
+
+def test_a_leader_that_dozed_off_goes_on_once_it_has_listened() -> None:
+    s: Succession[int] = Succession("optimizer-0")
+    s.joined("optimizer-1")
+    for ms in range(80):
+        s.offer(ms, ms, ms * 1e-3)
+    assert s.offer(80, 80, 0.120) == []
+    assert s.look(0.120 + 0.5 * SETTLE_S) == []
+    assert seqs(s.look(0.120 + SETTLE_S)) == [(80, 80)]

@@ -8,6 +8,7 @@ on with the tick after the last one heard. No input or output and no clock here:
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass
 from typing import Generic, TypeVar
@@ -17,7 +18,9 @@ T = TypeVar("T")
 PATIENCE_S = 0.05
 """The first in line takes over when it has held an output for so long; the second waits twice as long, and so on."""
 ASLEEP_S = 0.6 * PATIENCE_S
-"""A leader that has not looked for so long may have been taken for dead: it stands by until it knows better."""
+"""A leader that has not looked for so long may have been taken for dead: it stands by ..."""
+SETTLE_S = 0.02
+"""... and goes on after so long without word of another leader."""
 LINK_S = 1.0
 """After so long a sleep the links may have been given up ..."""
 RELINK_S = 2.0
@@ -61,6 +64,7 @@ class Succession(Generic[T]):
         self._published_t_ns = self._offered_t_ns = _NEVER  # by whomever; by the stage here
         self._looked_s = -1.0
         self._not_before_s = 0.0  # when it may take over at the earliest
+        self._regain_s = math.inf  # when it leads again, if it hears of no other leader
 
     @property
     def role(self) -> str:
@@ -90,6 +94,7 @@ class Succession(Generic[T]):
         if self.leads:
             self._step_back("succession.yielded")
         self.joined(worker)
+        self._regain_s = math.inf
         self._leader, self._published_t_ns, self._seq = worker, t_ns, seq + 1
         while self._held and self._held[0].t_ns <= t_ns:
             self._held.popleft()
@@ -115,9 +120,8 @@ class Succession(Generic[T]):
             return self._release()
         waited_s = now_s - self._held[0].since_s
         alone = not self._had_company
-        if alone or (waited_s >= PATIENCE_S * (1 + self._rank()) and now_s >= self._not_before_s):
-            return self._take_over()
-        return []
+        its_turn = waited_s >= PATIENCE_S * (1 + self._rank()) and now_s >= self._not_before_s
+        return self._take_over() if alone or its_turn or now_s >= self._regain_s else []
 
     def _rank(self) -> int:
         """How many come before this one, the leader that is to be replaced aside."""
@@ -129,10 +133,11 @@ class Succession(Generic[T]):
         self._looked_s = now_s
         if slept_s <= ASLEEP_S or not self._had_company:
             return False
-        if slept_s > LINK_S:
-            self._not_before_s = now_s + RELINK_S
         if self.leads:
             self._step_back("succession.slept")
+            self._regain_s = now_s + SETTLE_S
+        if slept_s > LINK_S:
+            self._not_before_s, self._regain_s = now_s + RELINK_S, math.inf
         # What others made of the meantime is waiting to be heard.
         for held in self._held:
             held.since_s = now_s
@@ -144,7 +149,7 @@ class Succession(Generic[T]):
         self.counters[why] = self.counters.get(why, 0) + 1
 
     def _take_over(self) -> list[Turn[T]]:
-        self.leads, self._leader = True, ""
+        self.leads, self._leader, self._regain_s = True, "", math.inf
         self.counters["succession.led"] = self.counters.get("succession.led", 0) + 1
         return self._release()
 
