@@ -35,6 +35,18 @@ class RigSettings:
 
 @dataclass(frozen=True, slots=True)
 class IngestSettings:
+    mode: str = _f(
+        "batch",
+        "selection: 'batch' by batch, or 'event' by event, each as soon as its neighbourhood is complete",
+        choices=("batch", "event"),
+    )
+    slice_ms: float = _f(1.0, "mode 'event': what was selected goes to flow this often, ms", lo=0.1, hi=100.0)
+    rest_ms: float = _f(
+        5.0,
+        "mode 'event': a cell of the image (about as many as the quota) gives one event at the most in this time, ms",
+        lo=0.0,
+        hi=1000.0,
+    )
     batch: str = _f(
         "first",
         "what closes a batch: 'count', 'time', or 'first' of both",
@@ -293,6 +305,8 @@ def _check_together(s: Settings, source: str) -> None:
         )
     if s.optimizer.preintegration_s > s.optimizer.knot_s:
         raise ConfigError(f"{source}: optimizer.preintegration_s: must not exceed optimizer.knot_s")
+    if s.ingest.mode == "event" and s.ingest.selection != "burst":
+        raise ConfigError(f"{source}: ingest.selection: must be 'burst' with ingest.mode = 'event'")
     if s.ingest.refractory_ms >= s.ingest.memory_ms:
         raise ConfigError(f"{source}: ingest.refractory_ms: must be below ingest.memory_ms")
 

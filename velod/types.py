@@ -69,6 +69,9 @@ class EventBatch:
     The batch spans the left events with ``t_start_ns <= t < t_ns``; ``t_ns`` is its (exclusive) end. A selected event
     may be older than ``t_start_ns``, by up to half the memory: it is selected in the batch that completes its
     neighbourhood.
+
+    Event by event (``ingest.mode``) a batch comes in several parts: ``t_ns`` is the end of the part, ``t_start_ns``
+    the start of the batch, and ``n_events`` counts those since the part before.
     """
 
     seq: int
@@ -80,6 +83,8 @@ class EventBatch:
     age: U32  # (n,) ns before t_ns, >= 1
     p: U8  # (n,) 1 = ON, 0 = OFF
     patch: U32  # (n, 25) ages (ns) of the 5x5 same-polarity neighbours, row-major, 0 = none
+    batch_seq: int = -1  # of the StereoBatch that carries the same events; -1: seq itself
+    first: int = 0  # position there of the first event
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +98,7 @@ class StereoBatch:
     t_ns: int
     t_start_ns: int
     unit_ns: int
-    x: U16  # (n,) as in the EventBatch of the same seq
+    x: U16  # (n,) as in the EventBatch of the same seq, or in all those of this batch_seq
     y: U16  # (n,)
     age: U32  # (n,) ns
     p: U8  # (n,)
@@ -117,6 +122,9 @@ class FlowBatch:
     n: F32  # (m, 2) unit vector along the normal flow (direction of motion of the edge)
     speed: F32  # (m,) normal flow, px/s, > 0
     sigma: F32  # (m,) standard deviation of speed, px/s
+    batch_seq: int = -1  # of the DepthBatch at the same events; -1: seq itself
+    first: int = 0  # what to add to index for the position there
+    t_start_ns: int = -1  # start of the batch, -1: not known
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,6 +139,7 @@ class DepthBatch:
     inv_depth: F32  # (m,) 1/Z, 1/m, frame C
     sigma: F32  # (m,) standard deviation of inv_depth, 1/m
     refined: U8  # (m,) 1 = plane coincidence, 0 = block matching only
+    t_start_ns: int = -1  # start of the batch, -1: not known
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,6 +23,7 @@ MODES = {
     "count": settings(batch="count", count=700),
     "time": settings(batch="time", period_ms=7.0),
     "first": settings(batch="first", count=900, period_ms=8.0, hot_pixel_hz=60.0, background_ms=30.0),
+    "event": settings(mode="event", batch="first", count=900, period_ms=8.0, slice_ms=0.7),
 }
 
 

@@ -42,7 +42,8 @@ class DepthStage:
     def handle(self, message: StereoBatch) -> list[DepthBatch]:
         """One DepthBatch for a StereoBatch; none (counted ``batches.size``) where it does not fit the calibration.
 
-        Counters: ``points`` seen, of them ``points.refined`` and ``points.block`` published, ``points.no_match``,
+        Counters: ``points`` seen, of them ``points.refined`` and ``points.block`` published, ``points.no_match``
+        (``points.overtaken`` among them),
         ``points.unconfirmed``, ``points.low_zncc``, ``points.ambiguous`` and ``points.too_far`` dropped, and
         ``unrefined.<why>``.
         """
@@ -52,6 +53,7 @@ class DepthStage:
         xy = self._rectification.left_xy[message.y, message.x]
         left, right_mirrored = self._surfaces(message)
         x, y = _nearest_pixel(xy[:, 0]), _nearest_pixel(xy[:, 1])
+        x[self._overtaken(message)] = -1
         matches = match(left, right_mirrored, x, y, self._settings.block_px, self._settings.max_disparity_px)
         refined = self._refine(message, matches.disparity)
         is_refined = refined.outcome == REFINED
@@ -72,6 +74,16 @@ class DepthStage:
             and int(message.p.max(initial=0)) < 2
             and message.unit_ns > 0
         )
+
+    def _overtaken(self, message: StereoBatch) -> Bools:
+        """(n,) where the surface no longer holds the event: a depth there would be that of another edge.
+
+        So it can be where events are selected before the batch's end (``ingest.mode = "event"``).
+        """
+        held = message.left[message.p, message.y, message.x].astype(np.int64) * message.unit_ns
+        overtaken = np.asarray(held < message.age)
+        self.counters["points.overtaken"] += int(np.count_nonzero(overtaken))
+        return overtaken
 
     def _surfaces(self, message: StereoBatch) -> tuple[Surface, Surface]:
         """Time surfaces on the rectified grid: the left one, and the right one mirrored."""
@@ -180,6 +192,7 @@ class DepthStage:
             inv_depth=(disparity[index] * per_px).astype(np.float32),
             sigma=(sigma_px[index] * per_px).astype(np.float32),
             refined=is_refined[index].astype(np.uint8),
+            t_start_ns=message.t_start_ns,
         )
 
 

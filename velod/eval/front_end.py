@@ -6,7 +6,7 @@ flow, depth and optimizer.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -17,6 +17,7 @@ from velod.flow.stage import FlowStage
 from velod.geometry.calibration import Calibration
 from velod.io.model import Imu
 from velod.optimizer.flow_equation import pairs
+from velod.optimizer.parts import Parts, batch_seq
 from velod.optimizer.stage import OptimizerStage
 from velod.types import I64, PATCH, DepthBatch, EventBatch, FlowBatch, ImuSamples, Message, Velocity
 
@@ -47,10 +48,8 @@ class FrontEnd:
 
     def batches(self) -> Iterator[tuple[FlowBatch, DepthBatch]]:
         """Flow and depth of each batch, cut down to the events that have both."""
-        depths = {batch.seq: batch for batch in self.depths}
-        for flow in self.flows:
-            if flow.seq in depths:
-                yield joined(flow, depths[flow.seq])
+        for flow, depth in pair_up(self.flows, self.depths):
+            yield joined(flow, depth)
 
     def with_imu(self, imu: Imu) -> FrontEnd:
         """The same front end beside another IMU, sampled at the same times.
@@ -67,8 +66,8 @@ class FrontEnd:
         for m in self.messages:
             if isinstance(m, ImuSamples):
                 messages.append(m)
-            elif m.seq in changed:
-                messages.append(changed[m.seq][0 if isinstance(m, FlowBatch) else 1])
+            elif m.seq in changed and isinstance(m, DepthBatch):
+                messages += changed[m.seq]
         return replace(self, messages=messages)
 
 
@@ -95,6 +94,17 @@ def estimate(front_end: FrontEnd, settings: Settings, calibration: Calibration) 
     optimizer = OptimizerStage(settings, calibration)
     out = (o for message in front_end.messages for o in optimizer.handle(message))
     return [o for o in out if isinstance(o, Velocity)]
+
+
+def pair_up(flows: Sequence[FlowBatch], depths: Sequence[DepthBatch]) -> Iterator[tuple[FlowBatch, DepthBatch]]:
+    """Flow and depth of each batch that has all its parts, in the order of ``depths``."""
+    batches = {depth.seq: Parts(depth) for depth in depths}
+    for flow in flows:
+        if (parts := batches.get(batch_seq(flow))) is not None:
+            parts.add(flow)
+    for parts in batches.values():
+        if (depth := parts.whole) is not None:
+            yield parts.joined(depth), depth
 
 
 def joined(flow: FlowBatch, depth: DepthBatch) -> tuple[FlowBatch, DepthBatch]:

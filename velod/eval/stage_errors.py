@@ -20,6 +20,7 @@ from velod.geometry.calibration import Calibration
 from velod.geometry.camera import motion_field_rows
 from velod.geometry.rectify import Rectification, rectify
 from velod.io.model import Truth
+from velod.optimizer.parts import batch_seq
 from velod.types import F64, I64, DepthBatch, EventBatch, FlowBatch
 
 Bools = NDArray[np.bool_]
@@ -179,13 +180,15 @@ class _Events:
     ) -> _Events:
         first = np.cumsum([0, *(len(batch.x) for batch in selected)])
         begin = {batch.seq: int(k) for batch, k in zip(selected, first, strict=False)}
+        # Event by event a batch comes in parts, of which depth answers all at once.
+        whole = {batch_seq(batch): begin[batch.seq] for batch in selected if batch.first == 0}
         t_ns = np.concatenate([np.empty(0, np.int64), *(b.t_ns - b.age.astype(np.int64) for b in selected)])
         i, j, p = (
             np.concatenate([np.empty(0, np.uint8), *(getattr(b, c) for b in selected)]) for c in ("x", "y", "p")
         )
         x, y = rect.left_xy[j.astype(np.int64), i.astype(np.int64)].astype(np.float64).T
         flow = _spread_out(len(t_ns), begin, flows, ("n", "speed", "sigma"))
-        depth = _spread_out(len(t_ns), begin, depths, ("disparity", "inv_depth", "sigma", "refined"))
+        depth = _spread_out(len(t_ns), whole, depths, ("disparity", "inv_depth", "sigma", "refined"))
         seen = _look(true_depth, rect, t_ns, x, y)
         z, candidates = seen[:, 0], seen
         near, far = (f(seen, axis=1) for f in (np.fmin.reduce, np.fmax.reduce))

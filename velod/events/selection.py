@@ -97,6 +97,11 @@ def select_paper(
     return _columns(chosen, last)
 
 
+def cell_side_px(height: int, width: int, quota: int) -> int:
+    """Side of the coarse grid's cells: about as many cells as events wanted."""
+    return max(1, round(math.sqrt(height * width / quota)))
+
+
 def _columns(chosen: I32, surface: I64) -> tuple[U16, U16, U8]:
     _, h, w = surface.shape
     p, rest = np.divmod(np.sort(chosen), h * w)
@@ -124,8 +129,7 @@ def _choose(
     ``tolerance`` is that of the rule: ``reject_px`` for bursts, seconds about the neighbours' mean for the paper's.
     """
     _, h, w = surface.shape
-    # About as many cells as events wanted.
-    cell_px = max(1, round(math.sqrt(h * w / quota)))
+    cell_px = cell_side_px(h, w, quota)
     columns = -(-w // cell_px)
     index = np.empty(surface.size, np.int32)
     cell_end = np.zeros(columns * -(-h // cell_px) + 1, np.int32)

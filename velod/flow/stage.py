@@ -49,9 +49,9 @@ class FlowStage:
         for cause, count in zip(REFUSALS, refused.tolist(), strict=True):
             self.counters[f"flow.{cause}"] += count
         index, flow = index[:n].copy(), flow[:n]
-        x, y, nx_ny, speed, sigma = flow[:, 0], flow[:, 1], flow[:, 2:4], flow[:, 4], flow[:, 5]
-        columns = (np.ascontiguousarray(c) for c in (x, y, nx_ny, speed, sigma))
-        return [FlowBatch(m.seq, m.t_ns, size, index, m.age[index], *columns)]
+        x, y, nx_ny, speed, sigma = (np.ascontiguousarray(flow[:, k]) for k in (0, 1, slice(2, 4), 4, 5))
+        batch = (m.batch_seq, m.first, m.t_start_ns)
+        return [FlowBatch(m.seq, m.t_ns, size, index, m.age[index], x, y, nx_ny, speed, sigma, *batch)]
 
     def _well_formed(self, m: EventBatch) -> bool:
         h, w = self._xy.shape[:2]

@@ -20,6 +20,7 @@ from velod.ingest.batch import OpenBatch
 from velod.ingest.budget import Budget
 from velod.ingest.imu import ImuStream
 from velod.ingest.ordering import ClockRestart
+from velod.ingest.slices import Slices
 from velod.ingest.stream import CameraStream
 from velod.types import F64, I64, U8, U16, EventBatch, EventPacket, ImuPacket, ImuSamples, StereoBatch
 
@@ -45,6 +46,9 @@ class IngestStage:
         self._batch_seq = -1
         self._imu_seq = -1
         self._turn = 0.0  # a batch is made when it reaches 1
+        cal = calibration
+        by_event = settings.ingest.mode == "event"
+        self._slices = Slices(settings, cal.left.width, cal.left.height) if by_event else None
         self._start_epoch()
 
     def _start_epoch(self) -> None:
@@ -56,10 +60,17 @@ class IngestStage:
         self._taken = new_surface(cal.left.height, cal.left.width)
         self._open = OpenBatch(s)
         self._batch_t_ns = 0
+        if self._slices is not None:
+            # Parts of a batch that will never be whole must not join another one.
+            self._batch_seq += self._slices.has_sent
+            self._slices.forget()
         self.alarms.clear()
 
     def handle(self, message: EventPacket | ImuPacket) -> list[Output]:
-        """Batches that the message closes (each as StereoBatch, EventBatch, ImuSamples), or its IMU samples."""
+        """Batches that the message closes (each as StereoBatch, EventBatch, ImuSamples), or its IMU samples.
+
+        Event by event, the EventBatches are slices, and go out before the StereoBatch of the same events.
+        """
         if isinstance(message, ImuPacket):
             return self._on_imu(message)
         return self._on_events(message)
@@ -113,7 +124,7 @@ class IngestStage:
             left, right, batch = self._left, self._right, self._open
             batch.find_end(left.queue.peek()[2], left.watermark_ns)
             horizon = batch.horizon_ns(left.watermark_ns)
-            batch.fill(left.enter_before(horizon))
+            out += self._enter_left(horizon)
             # Events of the right camera do not pile up while the left one is silent.
             right.enter_before(max(horizon, right.watermark_ns - self._skew_ns))
             if batch.t_start_ns is None or batch.t_end_ns is None or not self._is_complete(batch.t_end_ns):
@@ -123,6 +134,14 @@ class IngestStage:
             batch.begin_next()
         self._watch_skew()
         return out
+
+    def _enter_left(self, horizon_ns: int) -> list[Output]:
+        """Move left events of the open batch into the surfaces; returns what event-by-event mode selects of them."""
+        if self._slices is None:
+            self._open.fill(self._left.enter_before(horizon_ns))
+            return []
+        rest = 1.0 / self.budget.selection
+        return [*self._slices.advance(self._left, self._open, self._batch_seq + 1, horizon_ns, rest)]
 
     def _is_complete(self, t_end_ns: int) -> bool:
         """Whether all events before ``t_end_ns`` are known, or will not be waited for."""
@@ -145,7 +164,10 @@ class IngestStage:
                 self.alarms.pop(f"camera.{name}", None)
 
     def _emit_within_budget(self, t_start_ns: int, t_end_ns: int, n_events: int) -> list[Output]:
-        """A batch that is not made has no number, so nobody waits for it."""
+        """A batch that is not made has no number, so nobody waits for it.
+
+        What was selected of it event by event belongs to the next one.
+        """
         self._turn = min(self._turn, 1.0) + self.budget.batches
         if self.budget.room <= 0 or self._turn < 1.0:
             self.counters["shed.batches"] += 1
@@ -168,11 +190,18 @@ class IngestStage:
                 self._right.last.max(axis=0),
             )
         )
-        x, y, age, p, patch = self._select(left, t_start_ns, t_end_ns)
+        event_batches: list[EventBatch]
+        if self._slices is None:
+            x, y, age, p, patch = self._select(left, t_start_ns, t_end_ns)
+            event_batches = [EventBatch(seq, t_end_ns, t_start_ns, n_events, x, y, age, p, patch, seq)]
+        else:
+            x, y, age, p = self._slices.selected(t_end_ns)
+            event_batches = self._slices.rest_of(self._open, seq, t_end_ns)
+            t_start_ns = self._slices.begin_batch()
         unit_ns = age_unit_ns(memory_ns)
         return [
             StereoBatch(seq, t_end_ns, t_start_ns, unit_ns, x, y, age, p, left, right, left_last, right_last),
-            EventBatch(seq, t_end_ns, t_start_ns, n_events, x, y, age, p, patch),
+            *event_batches,
             self._no_samples(t_end_ns),
         ]
 

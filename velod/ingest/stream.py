@@ -76,7 +76,7 @@ class CameraStream:
         self.queue = EventQueue()
         self.watermark_ns = NEVER
         self._counters = counters
-        self._refractory_ns = round(settings.refractory_ms * 1e6)
+        self.refractory_ns = round(settings.refractory_ms * 1e6)
         self._background_ns = round(settings.background_ms * 1e6)
         self._hot_count = float(settings.hot_pixel_hz)
         self._filtered = self._background_ns > 0 or self._hot_count > 0
@@ -119,13 +119,18 @@ class CameraStream:
             self.queue.drop(excess)
             self._counters["events.overflow"] += excess
 
-    def enter_before(self, t_ns: int) -> I64:
-        """Move the queued events earlier than ``t_ns`` into the surfaces; returns their times."""
+    def take_before(self, t_ns: int) -> tuple[U16, U16, I64, U8]:
+        """Columns x, y, t_ns, p of the queued events earlier than ``t_ns``, which leave the queue."""
         x, y, t, p = self.queue.peek()
         n = int(np.searchsorted(t, t_ns, side="left"))
-        update_sae(x[:n], y[:n], t[:n], p[:n], self.first, self.last, self._refractory_ns)
         self.queue.drop(n)
-        return t[:n]
+        return x[:n], y[:n], t[:n], p[:n]
+
+    def enter_before(self, t_ns: int) -> I64:
+        """Move the queued events earlier than ``t_ns`` into the surfaces; returns their times."""
+        x, y, t, p = self.take_before(t_ns)
+        update_sae(x, y, t, p, self.first, self.last, self.refractory_ns)
+        return t
 
 
 @njit(cache=True, nogil=True)

@@ -7,7 +7,7 @@ stays away for longer than ``max_wait_ms`` of sensor time is a velocity made wit
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from velod.geometry.calibration import Calibration
 from velod.optimizer.attitude import Attitude
 from velod.optimizer.dead_reckoning import DeadReckoning
 from velod.optimizer.estimator import Estimator
+from velod.optimizer.parts import Parts, batch_seq
 from velod.types import NS_PER_S, DepthBatch, FlowBatch, ImuSamples, Odometry, TrackingState, Velocity
 
 UNKNOWN_SIGMA = 100.0
@@ -34,14 +35,6 @@ IMU_GAP_NS = NS_PER_S
 """A longer hole in the IMU cannot be bridged: start anew."""
 
 
-@dataclass(slots=True)
-class _Pending:
-    """Parts of one batch that have arrived."""
-
-    flow: FlowBatch | None = None
-    depth: DepthBatch | None = None
-
-
 class OptimizerStage:
     """``handle(FlowBatch | DepthBatch | ImuSamples) -> [Velocity | Odometry]``."""
 
@@ -54,7 +47,7 @@ class OptimizerStage:
         self.alarms: dict[str, str] = {}
         self._seq = 0
         self._reckoning = DeadReckoning(settings.optimizer.window_s, settings.imu.gyro_noise)
-        self._pending: dict[int, _Pending] = {}  # by seq
+        self._pending: dict[int, Parts] = {}  # by the number of the batch
         self._ends: dict[int, int] = {}  # seq -> end of closed batches that have not been taken in
         self._taken: set[int] = set()  # taken in before an earlier one that is still missing
         self._next_seq = -1  # first batch not yet taken in nor given up; -1: nothing heard from ingest yet
@@ -90,23 +83,13 @@ class OptimizerStage:
         self.counters[name] = self.counters.get(name, 0) + by
 
     def _take_part(self, part: FlowBatch | DepthBatch) -> None:
-        """Keep one part of a batch until the other comes; what is of no use is counted."""
-        seq = part.seq
+        """Keep one part of a batch until the others come; what is of no use is counted."""
+        seq = batch_seq(part)
         if seq in self._taken or seq < self._next_seq:
             self._count("batch.duplicate")
             return
-        pending = self._pending.setdefault(seq, _Pending())
-        other = pending.depth if isinstance(part, FlowBatch) else pending.flow
-        if other is not None and other.t_ns != part.t_ns:
-            # one of them is from before a restart of ingest, which counts from 0 again
+        if not self._pending.setdefault(seq, Parts()).add(part):
             self._count("batch.of_another_ingest")
-            if other.t_ns > part.t_ns:
-                return
-            self._pending[seq] = pending = _Pending()
-        if isinstance(part, FlowBatch):
-            pending.flow = part
-        else:
-            pending.depth = part
 
     def _take_imu(self, m: ImuSamples) -> None:
         if m.event_t_ns + CLOCK_RESTART_NS < self._event_t_ns:
@@ -183,15 +166,15 @@ class OptimizerStage:
     def _take_in_order(self, tau: int) -> bool:
         """Take in the batches that ended by ``tau``; False while one of them, or word of the events, is missing."""
         while self._next_seq >= 0:
-            p = self._pending.get(self._next_seq)
+            depth = self._whole(self._next_seq)
             if self._next_seq in self._taken:
                 self._next_after(self._next_seq)
-            elif p is not None and p.flow is not None and p.depth is not None:
-                if p.flow.t_ns > tau:
+            elif depth is not None:
+                if depth.t_ns > tau:
                     return True
-                if p.flow.t_ns > self._imu_t_ns:
+                if depth.t_ns > self._imu_t_ns:
                     return False
-                self._take_in(self._next_seq, p.flow, p.depth)
+                self._take_in(self._next_seq, depth)
                 self._next_after(self._next_seq)
             elif self._next_seq <= self._closed_seq:
                 return self._ends[self._next_seq] > tau
@@ -202,9 +185,9 @@ class OptimizerStage:
     def _take_out_of_order(self, tau: int) -> None:
         """Take in whatever is complete, and give up what is about to leave the window."""
         for seq in sorted(self._pending):
-            p = self._pending[seq]
-            if p.flow is not None and p.depth is not None and p.flow.t_ns <= tau:
-                self._take_in(seq, p.flow, p.depth)
+            depth = self._whole(seq)
+            if depth is not None and depth.t_ns <= tau:
+                self._take_in(seq, depth)
                 self._taken.add(seq)
         oldest = tau - int(self._settings.optimizer.window_s * NS_PER_S)
         while 0 <= self._next_seq <= self._closed_seq:
@@ -220,8 +203,13 @@ class OptimizerStage:
         self._taken.discard(seq)
         self._next_seq = seq + 1
 
-    def _take_in(self, seq: int, flow: FlowBatch, depth: DepthBatch) -> None:
-        del self._pending[seq]
+    def _whole(self, seq: int) -> DepthBatch | None:
+        """The depth of a batch of which all parts are there."""
+        parts = self._pending.get(seq)
+        return None if parts is None else parts.whole
+
+    def _take_in(self, seq: int, depth: DepthBatch) -> None:
+        flow = self._pending.pop(seq).joined(depth)
         if not self._estimator.memory.covers(flow.t_ns, flow.t_ns):
             self._count("batch.before_imu")
             return

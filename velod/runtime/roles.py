@@ -90,7 +90,7 @@ class IngestShell(WorkerShell):
         for output in outputs:
             if isinstance(output, EventBatch | StereoBatch):
                 self._dispatch.send(output, t_origin_ns)
-                if isinstance(output, EventBatch):
+                if isinstance(output, StereoBatch):
                     self._load.note_batch()
                 self.health.add_latency("stage", time.time_ns() - cause.t_pub_ns)
             elif isinstance(output, ImuSamples):

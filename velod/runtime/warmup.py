@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import tempfile
 from collections.abc import Iterator
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -57,6 +58,9 @@ def fill_cache(settings: Settings, calibration: Calibration | None = None) -> No
     ensure_cache_directory()
     for stage in STAGES:
         warm_up(stage, settings, calibration or plain_calibration())
+    # Ingest has kernels of its own in each of its modes.
+    other = replace(settings.ingest, mode="event" if settings.ingest.mode == "batch" else "batch", selection="burst")
+    warm_up("ingest", replace(settings, ingest=other), calibration or plain_calibration())
 
 
 def plain_calibration() -> Calibration:

@@ -1,0 +1,125 @@
+"""Selection event by event: an event is selected the moment the last of its neighbourhood has fired.
+
+The same rule as ``select_burst``, without a batch: each first event of a burst completes the neighbourhoods of those
+of the eight pixels two away behind which the edge has just passed. What is selected depends on the stream up to that
+event alone. Every cell of a coarse grid rests for a while after a selection, which keeps the image evenly covered and
+bounds the rate.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from velod.events.plane_fit import HALF, SIZE, fit_plane
+from velod.events.sae import NEVER
+from velod.events.selection import GOOD, MAX_ASYMMETRY
+from velod.types import I64, PATCH, U8, U16, U32
+
+I32 = NDArray[np.int32]
+
+
+@njit(cache=True, nogil=True)
+def enter_and_select(
+    x: U16,
+    y: U16,
+    t_ns: I64,
+    p: U8,
+    first: I64,
+    last: I64,
+    refractory_ns: int,
+    taken: I64,
+    open_ns: I64,
+    row_cell: I64,
+    column_cell: I64,
+    rest_ns: int,
+    border_px: int,
+    memory_ns: int,
+    reject_px: float,
+    rejections: int,
+    min_neighbours: int,
+    max_rms_px: float,
+    at: I32,
+    stamps: I64,
+    n: int,
+) -> int:
+    """Enter events into ``first`` and ``last`` as ``update_sae`` does; note what each one completes.
+
+    A neighbourhood is complete when it passes the tests of ``select_burst`` at the arriving event: its middle at most
+    half the memory old and not in ``taken`` (2, h, w), symmetric, and one plane through ``min_neighbours``. A cell,
+    which ``row_cell`` (h,) and ``column_cell`` (w,) give, takes the next one when ``open_ns`` (rows, columns) says:
+    ``rest_ns`` after the last.
+
+    Writes (p, y, x) of the selected to ``at`` (capacity, 3) and the stamps of their neighbourhoods to ``stamps``
+    (capacity, 25), row-major, NEVER where none, from row ``n`` on; returns the number of rows then filled. What does
+    not fit is not selected.
+    """
+    _, h, w = first.shape
+    low = max(border_px, HALF)
+    age = np.empty(SIZE, np.float64)
+    for i in range(t_ns.size):
+        k, r, c, t = int(p[i]), int(y[i]), int(x[i]), int(t_ns[i])
+        in_burst = t - last[k, r, c] < refractory_ns
+        last[k, r, c] = t
+        if in_burst:
+            continue
+        first[k, r, c] = t
+        for dr in range(-HALF, HALF + 1, HALF):
+            rm = r - dr
+            if rm < low or rm >= h - low:
+                continue
+            opens = open_ns[row_cell[rm]]
+            for dc in range(-HALF, HALF + 1, HALF):
+                cm = c - dc
+                if cm < low or cm >= w - low or t < opens[column_cell[cm]] or n == len(at) or (dr == 0 and dc == 0):
+                    continue
+                middle = first[k, rm, cm]
+                # On a plane whose newest outer neighbour is the arriving event the one opposite to it is the oldest.
+                if t - middle > memory_ns // 2 or first[k, rm - dr, cm - dc] > middle or middle == taken[k, rm, cm]:
+                    continue
+                if not _symmetric(first[k], rm, cm, t, memory_ns):
+                    continue
+                for q in range(SIZE):
+                    # The age of the arriving event is 1 ns: 0 is a missing one.
+                    a = t + 1 - first[k, rm - HALF + q // PATCH, cm - HALF + q % PATCH]
+                    age[q] = a * 1e-9 if a <= memory_ns else 0.0
+                left, gx, gy, _, rms, _, _, _ = fit_plane(age, reject_px, rejections, min_neighbours)
+                # A cell that has waited for another rest takes what is merely acceptable.
+                waited = t >= opens[column_cell[cm]] + rest_ns
+                if left == 0 or not rms < (1.0 if waited else GOOD) * max_rms_px * math.hypot(gx, gy):
+                    continue
+                at[n, 0], at[n, 1], at[n, 2] = k, rm, cm
+                for q in range(SIZE):
+                    stamps[n, q] = first[k, rm - HALF + q // PATCH, cm - HALF + q % PATCH]
+                n += 1
+                taken[k, rm, cm] = middle
+                opens[column_cell[cm]] = t + rest_ns
+    return n
+
+
+@njit(cache=True, nogil=True)
+def _symmetric(surface: I64, r: int, c: int, t: int, memory_ns: int) -> bool:
+    """Whether opposite outer neighbours lie symmetrically about (r, c) in time, as on a plane; none: oldest."""
+    middle = min(t - surface[r, c], memory_ns)
+    symmetric = antisymmetric = 0
+    for j in range(4):
+        dr, dc = HALF * (j // 3 - 1), HALF * (j % 3 - 1)
+        a = min(t - surface[r + dr, c + dc], memory_ns) - middle
+        b = min(t - surface[r - dr, c - dc], memory_ns) - middle
+        symmetric += abs(a + b)
+        antisymmetric += abs(a - b)
+    return symmetric <= MAX_ASYMMETRY * antisymmetric
+
+
+def all_open(rows: int, columns: int) -> I64:
+    """A grid of cells each of which takes the next event at once."""
+    return np.full((rows, columns), NEVER, np.int64)
+
+
+def ages_of(stamps: I64, t_end_ns: int, memory_ns: int) -> U32:
+    """Ages in ns before ``t_end_ns``, of the shape of ``stamps``; 0 where older than the memory."""
+    age = t_end_ns - stamps
+    return np.where(age <= memory_ns, age, 0).astype(np.uint32)
