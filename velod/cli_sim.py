@@ -28,9 +28,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--imu-hz", type=int, metavar="HZ", help="rate of the IMU, a divisor of 1,000,000 (default 200)"
     )
+    parser.add_argument("--threshold", type=float, metavar="C", help="contrast at which pixels fire (default 0.5)")
     group = parser.add_argument_group("real-sensor effects", "All off unless given.")
     group.add_argument(
-        "--threshold-spread", type=float, metavar="C", help="mismatch of the thresholds of 0.5 (sigma; default 0.021)"
+        "--threshold-spread", type=float, metavar="C", help="mismatch of the thresholds (sigma; default 0.021)"
     )
     for option, field, kind, unit, text in _EFFECTS:
         group.add_argument(option, dest=field, type=kind, default=kind("0"), metavar=unit, help=text)
@@ -47,6 +48,8 @@ def recipe_of(args: argparse.Namespace) -> Sequence:
     recipe = sequence(args.sequence)
     effects = Effects(radtan=args.distortion, **{field: getattr(args, field) for _, field, *_ in _EFFECTS})
     events, imu = recipe.events, recipe.imu
+    if args.threshold is not None:
+        events = replace(events, threshold=args.threshold)
     if args.threshold_spread is not None:
         events = replace(events, threshold_sigma=args.threshold_spread)
     if args.imu_hz is not None:

@@ -73,7 +73,7 @@ class IngestSettings:
     border_px: int = _f(5, "events closer than this to the image's edge are not selected", lo=2, hi=100)
     paper_time_share: float = _f(
         0.05,
-        "rule 3 of Sec. V-A: |t - mean t of the neighbours| at most this share of memory_ms",
+        "rule 3 of Sec. V-A: |t - mean t of the neighbours| at most this share of the batch's duration",
         above=0.0,
         hi=1.0,
     )

@@ -149,12 +149,12 @@ def paper_twin(last: np.ndarray, t_start: int, t_end: int, share: float) -> set[
             continue
         patch = np.delete(last[p, y - 2 : y + 3, x - 2 : x + 3].ravel(), 12)
         near = patch[(patch >= t_end - MEMORY) & (patch < t_end)]
-        if len(near) > 15 and abs(last[p, y, x] - near.mean()) <= share * MEMORY:
+        if len(near) > 15 and abs(last[p, y, x] - near.mean()) <= share * (t_end - t_start):
             kept.add((x, y, p))
     return kept
 
 
-@pytest.mark.parametrize("share", [0.01, 0.05])
+@pytest.mark.parametrize("share", [0.025, 0.125])
 def test_the_papers_rules_agree_with_their_plain_twin(share: float) -> None:
     events = edges(speed=300.0, angle=0.6)
     rng = np.random.default_rng(7)

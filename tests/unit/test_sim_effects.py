@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from velod.cli import main
+from velod.cli_stages import true_depth_of
 from velod.geometry.camera import distort, normalised, pixels
 from velod.io import EventColumns, open_recording
 from velod.sim import sequence, simulate
@@ -173,6 +174,18 @@ def test_a_recording_with_every_effect_is_one_that_velod_reads(tmp_path: Path) -
             assert np.all(np.diff(t_us) >= 0)
             assert 1e4 < len(t_us) < 2e6 * 0.11
         assert np.all(file["events/left/t"][:] % 200 == 0)
+    # Whatever the lens and the sensors do, the simulator knows its own scene.
+    true_depth = true_depth_of(recording)
+    assert true_depth is not None and "ray casting" in true_depth.how
+
+
+def test_a_lower_threshold_fires_more_often(tmp_path: Path) -> None:
+    counts = []
+    for threshold in ("0.25", "0.5"):
+        path = tmp_path / f"{threshold}.h5"
+        assert main(["sim", "corridor-1", "-o", str(path), "--seconds", "0.03", "--threshold", threshold]) == 0
+        counts.append(open_recording(path).n_events)
+    assert counts[0] > 1.5 * counts[1] > 0
 
 
 def test_effects_that_are_off_change_nothing(tmp_path: Path) -> None:

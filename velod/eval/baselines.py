@@ -89,7 +89,7 @@ def paper_settings(settings: Settings) -> Settings:
     weights  one fixed P_c, "set empirically" (below Eq. 14): 20 px/s, and a fifth of the information
     spline   of the velocity itself (Eq. 7), knots of 0.1 s, preintegration over 0.03 s (Sec. V-A)
 
-    Rule 3's share is of the neighbours' memory, not of the batch which would cull short batches to nothing.
+    The SAE reaches ``memory_ms`` back whatever a batch's length; the paper sets it no limit.
     Robust weights, gravity as a state and the start without an attitude stay velod's: Eq. 14 has no loss and needs
     the true initial attitude, which no run here is given.
     """

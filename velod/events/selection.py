@@ -86,13 +86,13 @@ def select_paper(
     """The culling rules of Sec. V-A on the unfiltered surface ``last`` (2, h, w), int64 ns.
 
     Kept are events in [t_start_ns, t_end_ns) that are (1) ``border_px`` inside, (2) have more than 15 neighbours
-    and (3) differ from the neighbours' mean time by at most ``time_share * memory_ns``.
+    and (3) differ from the neighbours' mean time by at most ``time_share`` of the batch's duration.
     """
     mask = ((last >= t_start_ns) & (last < t_end_ns)).view(np.uint8)
     none_taken = np.full(last.shape, NEVER, np.int64)
     chosen = _choose(
         last, mask, t_end_ns, memory_ns, border_px, quota, seq,
-        False, time_share * memory_ns * 1e-9, 0, PAPER_MIN_NEIGHBOURS, math.inf, none_taken,
+        False, time_share * (t_end_ns - t_start_ns) * 1e-9, 0, PAPER_MIN_NEIGHBOURS, math.inf, none_taken,
     )  # fmt: skip
     return _columns(chosen, last)
 
