@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
-from velod import __version__
+from velod import __version__, cli_network
 from velod.cli_exit import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE, RunFailed
 from velod.cli_sim import add_options as add_sim_options
 
@@ -58,7 +58,7 @@ def _demo(args: argparse.Namespace) -> int:
 def _run(args: argparse.Namespace) -> int:
     from velod.cli_run import run
 
-    return run(args.config, args.calibration, args.only, args.connect, args.worker)
+    return run(args.config, args.calibration, args.only, args.connect, args.worker, args.keys, insecure=args.insecure)
 
 
 def _replay(args: argparse.Namespace) -> int:
@@ -111,13 +111,13 @@ def _sim(args: argparse.Namespace) -> int:
 def _echo(args: argparse.Namespace) -> int:
     from velod.cli_watch import echo
 
-    return echo(args.config, args.topic, args.connect, args.rig, args.count, args.timeout)
+    return echo(args.config, args.topic, cli_network.way_of(args), args.count, args.timeout)
 
 
 def _top(args: argparse.Namespace) -> int:
     from velod.cli_watch import top
 
-    return top(args.config, args.connect, args.rig, once=args.once)
+    return top(args.config, cli_network.way_of(args), once=args.once)
 
 
 def _config_show(args: argparse.Namespace) -> int:
@@ -188,6 +188,7 @@ first steps:
         _add_sim,
         _add_echo,
         _add_top,
+        _add_router,
         _add_config,
         _add_bench,
         _add_warmup,
@@ -249,8 +250,7 @@ def _add_play_options(parser: argparse.ArgumentParser) -> None:
 
 def _add_watch_options(parser: argparse.ArgumentParser) -> None:
     _add_config_option(parser)
-    parser.add_argument("--connect", metavar="ENDPOINT", help=f"where velod runs (default {LOCAL})")
-    parser.add_argument("--rig", metavar="NAME", help="name of the rig (default rig0)")
+    cli_network.add_way_options(parser, LOCAL)
 
 
 def _add_demo(commands: _Commands[argparse.ArgumentParser]) -> None:
@@ -298,6 +298,7 @@ def _add_run(commands: _Commands[argparse.ArgumentParser]) -> None:
     parser.add_argument("--only", type=_stages, metavar="STAGE[,STAGE]", help="only these stages on this host")
     parser.add_argument("--connect", metavar="ENDPOINT", help="join the velod there; settings come from it")
     parser.add_argument("--worker", metavar="NAME", help="name of the worker, with one stage in --only (flow-1)")
+    cli_network.add_guard_options(parser)
 
 
 def _add_replay(commands: _Commands[argparse.ArgumentParser]) -> None:
@@ -385,7 +386,8 @@ def _add_echo(commands: _Commands[argparse.ArgumentParser]) -> None:
         "depth, imu, done (between the processes). Arrays are shown by shape and range.",
         "  velod echo                            velocities of the velod on this host\n"
         "  velod echo health -n 4                four health messages, then stop\n"
-        "  velod echo velocity --connect tcp/10.0.0.5:17447",
+        "  velod echo velocity --connect tls/10.0.0.5:17448 --keys /etc/velod/keys\n"
+        "  velod echo --rig '*'                  velocities of all rigs, each with its rig's name",
     )
     parser.add_argument("topic", nargs="?", default="velocity", metavar="TOPIC")
     _add_watch_options(parser)
@@ -404,24 +406,45 @@ def _add_top(commands: _Commands[argparse.ArgumentParser]) -> None:
         "From the health message that every process sends once a second, and from who is alive.",
         "  velod top\n"
         "  velod top --once                      one table, for a log; exits with 1 if nobody answers\n"
-        "  velod top --connect tcp/10.0.0.5:17447 --rig drone",
+        "  velod top --connect tls/10.0.0.5:17448 --keys /etc/velod/keys --rig drone",
     )
     _add_watch_options(parser)
     parser.add_argument("--once", action="store_true", help="print one table and stop")
+
+
+def _add_router(commands: _Commands[argparse.ArgumentParser]) -> None:
+    parser = _command(
+        commands,
+        "router",
+        cli_network.router,
+        "A Zenoh router: where hosts or rigs meet.",
+        "Routes between this host's processes (loopback), other hosts (--listen) and another router (--connect).\n"
+        "Who comes from outside shows a certificate and may do what its role may.",
+        "  velod router --listen tls/0.0.0.0:17448 --keys /etc/velod/keys\n"
+        "  velod router --connect tls/site.example:17448 --keys /etc/velod/keys\n"
+        "                                        on a rig: its velocity goes up to the site's router\n"
+        "  velod router --zenoh fleet-router.json5\n"
+        "                                        as `velod config topology fleet` wrote it",
+    )
+    _add_config_option(parser)
+    cli_network.add_router_options(parser)
 
 
 def _add_config(commands: _Commands[argparse.ArgumentParser]) -> None:
     parser = _plain(
         commands.add_parser,
         "config",
-        help="Settings and calibration: show, init, check, calibration.",
-        description="Settings and calibration files. What is wrong is refused with file, key and reason.",
+        help="Settings, calibration, networks: show, init, check, calibration, keys, topology.",
+        description="Settings, calibration and network files. What is wrong is refused with file, key and reason.",
         epilog="""\
 examples:
   velod config init velod.toml            all settings with their meaning and defaults
   velod config check velod.toml           whether velod would take it
   velod config show -c velod.toml         the settings in effect
-  velod config calibration camchain.yaml  read a calibration (velod, Kalibr, ROS) and show it as velod's YAML""",
+  velod config calibration camchain.yaml  read a calibration (velod, Kalibr, ROS) and show it as velod's YAML
+  velod config keys keys --host 10.0.0.5  a CA, and certificates for a server and for each role
+  velod config topology fleet -o zenoh --host 10.0.0.5 --rig drone-1 --rig drone-2
+                                          zenoh configurations: routers, rigs, consumers""",
     )
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
 
@@ -444,6 +467,10 @@ examples:
     )
     calibration.add_argument("imu", nargs="?", metavar="IMU", help="Kalibr: file with T_cam_imu, where it is another")
     calibration.set_defaults(command=_config_calibration)
+    cli_network.add_config_actions(
+        keys=action("keys", "make a CA, and certificates for a server and for each role"),
+        topology=action("topology", "write zenoh configurations for a kind of network"),
+    )
 
 
 def _add_bench(commands: _Commands[argparse.ArgumentParser]) -> None:

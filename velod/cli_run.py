@@ -12,12 +12,24 @@ from velod.config import ConfigError, Settings
 
 
 def run(
-    config: str | None, calibration_file: str | None, only: list[str] | None, connect: str | None, worker: str | None
+    config: str | None,
+    calibration_file: str | None,
+    only: list[str] | None,
+    connect: str | None,
+    worker: str | None,
+    keys: str | None,
+    *,
+    insecure: bool,
 ) -> int:
     """Keep the service's processes alive until SIGINT or SIGTERM. Raises ConfigError, SessionError, ..."""
     settings = settings_of(config, calibration_file)
-    if connect is not None:
-        settings = replace(settings, zenoh=replace(settings.zenoh, connect=connect))
+    zenoh = replace(
+        settings.zenoh,
+        connect=connect or settings.zenoh.connect,
+        keys=keys or settings.zenoh.keys,
+        insecure=insecure or settings.zenoh.insecure,
+    )
+    settings = replace(settings, zenoh=zenoh)
     calibration = calibration_of(settings)
     if calibration is None and not settings.zenoh.connect:
         raise ConfigError(

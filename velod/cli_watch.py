@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import sys
 import time
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -14,9 +14,10 @@ from velod.cli_config import settings_of
 from velod.cli_exit import EXIT_FAILED
 from velod.cli_report import describe_attitude, describe_velocity
 from velod.client import Listener, Received
+from velod.config import ZenohSettings
 from velod.runtime.session import introducer_endpoint
 from velod.types import Health, Velocity
-from velod.wire.topics import HEALTH, TOPICS
+from velod.wire.topics import ANY_RIG, HEALTH, ODOMETRY, TOPICS, VELOCITY, parts
 
 _CLEAR_SCREEN = "\x1b[H\x1b[2J"
 _REFRESH_S = 1.0
@@ -25,39 +26,58 @@ _DISCOVERY_S = 3.0
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Which velod: its rig's name and where to reach it."""
+    """Which velod: its rig's name, or ``*`` for all rigs, and how to reach it."""
 
     rig: str
-    connect: str
+    zenoh: ZenohSettings
+
+    @property
+    def connect(self) -> str:
+        """The endpoint, or the file that names it."""
+        return self.zenoh.config or self.zenoh.connect
 
 
-def place_of(config: str | None, connect: str | None, rig: str | None) -> Place:
-    """From the settings file, unless said otherwise. Raises ConfigError."""
+@dataclass(frozen=True, slots=True)
+class Way:
+    """What the command line says of the way to a velod; what it leaves open the settings file says."""
+
+    connect: str | None = None
+    rig: str | None = None
+    keys: str | None = None
+    role: str | None = None
+    insecure: bool = False
+
+
+def place_of(config: str | None, way: Way, role: str) -> Place:
+    """Where to look, as ``role`` unless said otherwise. Raises ConfigError."""
     settings = settings_of(config)
-    return Place(rig or settings.rig.name, connect or introducer_endpoint(settings.zenoh))
+    zenoh = replace(
+        settings.zenoh,
+        connect=way.connect or introducer_endpoint(settings.zenoh),
+        listen="",
+        config="" if way.connect else settings.zenoh.config,
+        keys=way.keys or settings.zenoh.keys,
+        role=way.role or role,
+        insecure=way.insecure or settings.zenoh.insecure,
+    )
+    return Place(way.rig or settings.rig.name, zenoh)
 
 
-def echo(
-    config: str | None,
-    topic: str,
-    connect: str | None,
-    rig: str | None,
-    count: int | None,
-    timeout_s: float | None,
-) -> int:
+def echo(config: str | None, topic: str, way: Way, count: int | None, timeout_s: float | None) -> int:
     """Print the messages of a topic; 1 if ``timeout_s`` passes without one."""
     readable = [t.name for t in TOPICS.values() if t.message is not None]
     if topic not in readable:
         raise ValueError(f"no topic {topic!r} to print; topics: {', '.join(readable)}")
-    place = place_of(config, connect, rig)
-    with Listener(place.rig, (TOPICS[topic],), place.connect) as listener:
+    place = place_of(config, way, "consumer" if TOPICS[topic] in (VELOCITY, ODOMETRY) else "operator")
+    with Listener(place.rig, (TOPICS[topic],), place.zenoh) as listener:
         printed = 0
         while count is None or printed < count:
             received = listener.receive(math.inf if timeout_s is None else timeout_s)
             if received is None:
                 print(f"velod: no {topic} of rig {place.rig} in {timeout_s:g} s ({place.connect})", file=sys.stderr)
                 return EXIT_FAILED
-            print(describe(received), flush=True)
+            whose = f"{parts(TOPICS[topic], received.key)['rig']}: " if place.rig == ANY_RIG else ""
+            print(f"{whose}{describe(received)}", flush=True)
             printed += 1
     return 0
 
@@ -88,10 +108,10 @@ def _value(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def top(config: str | None, connect: str | None, rig: str | None, *, once: bool) -> int:
+def top(config: str | None, way: Way, *, once: bool) -> int:
     """The table of processes, drawn once a second; with ``once`` printed one time, 1 if nobody answers."""
-    place = place_of(config, connect, rig)
-    with Listener(place.rig, (HEALTH,), place.connect) as listener:
+    place = place_of(config, way, "operator")
+    with Listener(place.rig, (HEALTH,), place.zenoh) as listener:
         newest: dict[str, Received] = {}
         if once:
             _collect(listener, newest, _DISCOVERY_S, until_complete=True)

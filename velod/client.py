@@ -17,12 +17,13 @@ from types import TracebackType
 from typing import Any, Self
 
 from velod.config import ZenohSettings
+from velod.runtime.access import may_read
 from velod.runtime.inbox import Inbox
 from velod.runtime.measure import GapCounter
-from velod.runtime.session import open_session
+from velod.runtime.session import SessionError, open_session
 from velod.types import Velocity
 from velod.wire import Envelope, WireError, decode
-from velod.wire.topics import ALIVE, DEPTH, DONE, FLOW, VELOCITY, Topic, key, parts
+from velod.wire.topics import ALIVE, ANY_RIG, DEPTH, DONE, FLOW, VELOCITY, Topic, key, parts
 
 LOCAL = "tcp/127.0.0.1:17447"
 """Where a velod with default settings is found from its own host."""
@@ -31,6 +32,7 @@ CLOCK_RESTART_NS = 10_000_000_000
 """So far back in time the sensor's clock was set anew; what is less far back has been before."""
 
 _POLL_S = 0.5
+_OF = "@"
 # Several workers publish on these keys, and batches overtake each other.
 _OVERTAKING = {FLOW.name: 16, DEPTH.name: 16, DONE.name: 16}
 
@@ -52,28 +54,31 @@ class Received:
 
 
 class Listener:
-    """Messages of any topics of one rig. A context manager; nothing is received outside it.
+    """Messages of any topics of one rig, or of all (``"*"``). A context manager; nothing is received outside it.
 
     The connection is made, and made again after a loss, in the background. Each topic keeps the newest
     ``topic.qos.depth`` messages.
     """
 
-    def __init__(self, rig: str, topics: tuple[Topic, ...], connect: str = LOCAL) -> None:
+    def __init__(self, rig: str, topics: tuple[Topic, ...], settings: ZenohSettings) -> None:
         self._refused: dict[str, int] = {}
         self._rig = rig
         self._topics = {t.name: t for t in topics}
-        self._settings = ZenohSettings(connect=connect)
+        self._settings = settings
         self._inbox = Inbox()
         self._gaps: dict[tuple[str, str], GapCounter] = {}  # by topic and key
         self._stack = ExitStack()
         self._session: Any = None
 
     def __enter__(self) -> Self:
-        """Raises velod.runtime.session.SessionError where the endpoint is malformed."""
+        """Raises velod.runtime.session.SessionError: endpoint malformed, certificate or role of no use, refused."""
+        role = self._settings.role
+        for topic in self._topics.values():
+            if self._settings.connect.startswith("tls/") and not may_read(role, topic):
+                raise SessionError(f"the role {role} may not read {topic.name}")
         with ExitStack() as stack:
             self._session = stack.enter_context(open_session(self._settings))
             for topic in self._topics.values():
-                self._inbox.add_source(topic.name, topic.qos.depth)
                 stack.enter_context(self._subscribe(topic))
             self._stack = stack.pop_all()
         return self
@@ -85,8 +90,16 @@ class Listener:
         self._stack.close()
 
     def _subscribe(self, topic: Topic) -> Any:
+        # A queue for each rig: a hundred rigs must not push each other's newest messages out of one.
+        sources: dict[str, str] = {}
+
         def arrived(sample: Any) -> None:
-            self._inbox.put(topic.name, str(sample.key_expr), sample.payload.to_bytes())
+            at = str(sample.key_expr)
+            rig = parts(topic, at)["rig"]
+            if (source := sources.get(rig)) is None:
+                source = sources[rig] = topic.name if self._rig != ANY_RIG else f"{topic.name}{_OF}{rig}"
+                self._inbox.add_source(source, topic.qos.depth)
+            self._inbox.put(source, at, sample.payload.to_bytes())
 
         return self._session.declare_subscriber(key(topic, self._rig), arrived)
 
@@ -113,7 +126,7 @@ class Listener:
         return sorted((p["stage"], p["worker"]) for p in found)
 
     def _decode(self, source: str, found: str, data: bytes, t_ns: int) -> Received | None:
-        topic = self._topics[source]
+        topic = self._topics[source.partition(_OF)[0]]
         try:
             envelope = decode(data, topic.message)
         except WireError as e:
@@ -139,26 +152,37 @@ class Listener:
 
 
 class VelocityClient:
-    """The stream of velocities of one rig.
+    """The stream of velocities of one rig, or of all (``"*"``): ``rig`` then says whose velocity was the last one.
 
     A context manager and an endless iterable of valid velocities (``valid_only=False``: of all), in order of sensor
     time. Reconnects by itself. Velocities older than ``max_age_s`` when they are handed out are discarded and counted
     as ``stale``, invalid ones as ``invalid``, and those of a time that was handed out already as ``repeated`` (a
     stand-by that takes over may repeat one). Across hosts the age needs synchronised clocks; ``math.inf`` keeps
-    everything.
+    everything. ``tls/`` endpoints need ``keys``, a folder with certificates; ``tcp/`` ones on other hosts have to be
+    allowed with ``insecure``.
     """
 
     def __init__(
-        self, rig: str = "rig0", connect: str = LOCAL, max_age_s: float = 0.2, *, valid_only: bool = True
+        self,
+        rig: str = "rig0",
+        connect: str = LOCAL,
+        max_age_s: float = 0.2,
+        *,
+        valid_only: bool = True,
+        keys: str = "",
+        role: str = "consumer",
+        insecure: bool = False,
     ) -> None:
-        self._listener = Listener(rig, (VELOCITY,), connect)
+        settings = ZenohSettings(connect=connect, keys=keys, role=role, insecure=insecure)
+        self._listener = Listener(rig, (VELOCITY,), settings)
+        self.rig = rig
         self._max_age_s = max_age_s
         self._valid_only = valid_only
         self._discarded: dict[str, int] = {}
-        self._t_ns = -CLOCK_RESTART_NS  # sensor time of the newest one handed out
+        self._t_ns: dict[str, int] = {}  # by key: sensor time of the newest one handed out
 
     def __enter__(self) -> Self:
-        """Raises velod.runtime.session.SessionError where the endpoint is malformed."""
+        """Raises velod.runtime.session.SessionError: endpoint malformed, certificate of no use, TLS refused."""
         self._listener.__enter__()
         return self
 
@@ -180,14 +204,16 @@ class VelocityClient:
             age_s = (time.time_ns() - received.envelope.t_pub_ns) * 1e-9
             if not isinstance(velocity, Velocity):
                 continue
+            newest_t_ns = self._t_ns.get(received.key, -CLOCK_RESTART_NS)
             if age_s > self._max_age_s:
                 self._discard("stale")
-            elif self._t_ns - CLOCK_RESTART_NS < velocity.t_ns <= self._t_ns:
+            elif newest_t_ns - CLOCK_RESTART_NS < velocity.t_ns <= newest_t_ns:
                 self._discard("repeated")
             elif self._valid_only and not velocity.valid:
                 self._discard("invalid")
             else:
-                self._t_ns = velocity.t_ns
+                self._t_ns[received.key] = velocity.t_ns
+                self.rig = parts(VELOCITY, received.key)["rig"]
                 return velocity
         return None
 

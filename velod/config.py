@@ -204,8 +204,15 @@ class ImuSettings:
 @dataclass(frozen=True, slots=True)
 class ZenohSettings:
     port: int = _f(17447, "the introducer's port on loopback", lo=1, hi=65535)
-    connect: str = _f("", "endpoint of another host's velod, tcp/host:port; empty: this host is the introducer")
-    listen: str = _f("", "further endpoint on which other hosts may connect, tcp/address:port; empty: loopback only")
+    connect: str = _f("", "endpoint of another host's velod, tls/host:port; empty: this host is the introducer")
+    listen: str = _f("", "further endpoint on which other hosts may connect, tls/address:port; empty: loopback only")
+    keys: str = _f("", "folder with the certificates for tls/ endpoints, as `velod config keys` writes it")
+    role: str = _f(
+        "worker",
+        "as what this host connects with tls/, by the certificate of that name: driver, worker, consumer or operator",
+        choices=("driver", "worker", "consumer", "operator"),
+    )
+    insecure: bool = _f(False, "allow tcp/ endpoints beyond this host, open to everyone who can reach them")
     config: str = _f("", "a zenoh configuration file (JSON5) that replaces all of the above")
     shared_memory: bool = _f(True, "Zenoh's implicit shared memory between processes of one user")
     lossless: bool = _f(False, "replay: block instead of dropping; never beside a sensor")

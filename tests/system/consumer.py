@@ -16,6 +16,7 @@ from threading import Event, Lock, Thread
 from typing import IO, Any
 
 from velod.client import Listener, VelocityClient
+from velod.config import ZenohSettings
 from velod.types import Health, Velocity
 from velod.wire.topics import HEALTH, VELOCITY
 
@@ -26,11 +27,11 @@ def main() -> None:
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
     with Path(out).open("w", buffering=1) as file:
         log = _Log(file)
-        with Listener("rig0", (VELOCITY, HEALTH), endpoint) as listener:
+        with Listener("rig0", (VELOCITY, HEALTH), ZenohSettings(connect=endpoint, insecure=True)) as listener:
             print("ready", flush=True)
             raw = Thread(target=_note_raw, args=(listener, log, stop))
             raw.start()
-            with VelocityClient("rig0", endpoint, valid_only=False) as client:
+            with VelocityClient("rig0", endpoint, valid_only=False, insecure=True) as client:
                 while not stop.is_set():
                     velocity = client.receive(0.1)
                     if velocity is not None:

@@ -134,7 +134,7 @@ class Rig:
         save_calibration(calibration, self.recorded().calibration)
         tree = config.to_tree(self.settings)
         tree["rig"]["calibration"] = str(calibration)
-        tree["zenoh"]["listen"] = self.endpoint
+        tree["zenoh"].update(listen=self.endpoint, insecure=True)
         settings.write_text(config.to_toml(config.from_tree(tree)))
         options = ["--only", only] if only else []
         self.service = self._velod(self.compute, "service", "run", "-c", str(settings), *options)
@@ -148,7 +148,7 @@ class Rig:
     def start_worker(self, host: str, worker: str) -> subprocess.Popen[str]:
         """One more worker, on any host, until it is up."""
         stage = worker.partition("-")[0]
-        command = [sys.executable, "-P", "-m", f"velod.workers.{stage}", "--connect", self.endpoint]
+        command = [sys.executable, "-P", "-m", f"velod.workers.{stage}", "--connect", self.endpoint, "--insecure"]
         process = self.start(self.network[host], worker, [*command, "--worker", worker])
         self.wait_for(worker, "INFO up", 1)
         return process
@@ -156,7 +156,7 @@ class Rig:
     def start_player(self, host: str, speed: str = "1") -> subprocess.Popen[str]:
         """The sensor: plays the recording to its end."""
         command = [sys.executable, "-P", "-m", "velod.runtime.player", str(self.recording), "--speed", speed]
-        return self.start(self.network[host], "player", [*command, "--connect", self.endpoint])
+        return self.start(self.network[host], "player", [*command, "--connect", self.endpoint, "--insecure"])
 
     def start_consumer(self, host: str, name: str = "consumer") -> subprocess.Popen[str]:
         """Somebody who takes velocities, until it is told to end."""

@@ -95,7 +95,9 @@ class Supervisor:
         """Open the session, serve the settings, start the workers. Raises SessionError, NoServiceError."""
         with ExitStack() as stack:
             zenoh_settings = self._settings.zenoh
-            self.session = stack.enter_context(open_session(zenoh_settings, introducer=not zenoh_settings.connect))
+            self.session = stack.enter_context(
+                open_session(zenoh_settings, not zenoh_settings.connect, (self._settings.rig.name,))
+            )
             self._settings_from_service(stack)
             # Health is for whoever can follow, even in a lossless replay.
             self._outlet = stack.enter_context(Outlet(self.session, self._settings.rig.name))

@@ -16,6 +16,7 @@ import zenoh
 
 from velod.config import Settings, ZenohSettings
 from velod.runtime import warmup
+from velod.runtime.access import ROLES
 from velod.runtime.roles import SHELLS
 from velod.runtime.session import introducer_endpoint, open_session
 from velod.runtime.settings_service import fetch
@@ -63,6 +64,10 @@ def worker_arguments(settings: ZenohSettings, rig: str, worker: str) -> list[str
     arguments += ["--parent", str(os.getpid())]
     if settings.listen:
         arguments += ["--listen", settings.listen]
+    if settings.keys:
+        arguments += ["--keys", settings.keys, "--role", settings.role]
+    if settings.insecure:
+        arguments.append("--insecure")
     if settings.config:
         arguments += ["--zenoh-config", settings.config]
     if settings.lossless:
@@ -75,6 +80,9 @@ def zenoh_settings(args: argparse.Namespace) -> ZenohSettings:
     return ZenohSettings(
         connect=args.connect,
         listen=args.listen,
+        keys=args.keys,
+        role=args.role,
+        insecure=args.insecure,
         config=args.zenoh_config,
         shared_memory=not args.no_shared_memory,
         lossless=args.lossless,
@@ -93,6 +101,9 @@ def worker_parser(program: str, worker: str) -> argparse.ArgumentParser:
     parser.add_argument("--rig", default="rig0", help="name of the rig (default rig0)")
     parser.add_argument("--worker", default=worker, help="this worker's name, <stage>-<number>, one of its kind")
     parser.add_argument("--listen", default="", help="endpoint on which other hosts reach this process; any port")
+    parser.add_argument("--keys", default="", help="folder with the certificates for tls/ endpoints")
+    parser.add_argument("--role", default="worker", choices=ROLES, help="whose certificate to show (default worker)")
+    parser.add_argument("--insecure", action="store_true", help="allow tcp/ endpoints beyond this host")
     parser.add_argument("--zenoh-config", default="", help="a zenoh configuration file (JSON5) instead")
     parser.add_argument("--no-shared-memory", action="store_true", help="TCP only, within this host as well")
     parser.add_argument("--lossless", action="store_true", help="replay: keep a link that blocks for longer")

@@ -70,10 +70,13 @@ TOPICS: dict[str, Topic] = {
 
 _PART = re.compile(r"\{(\w+)\}")
 _FORBIDDEN = frozenset("/*$?# ")
+ANY_RIG = "*"
+"""In place of a rig's name, for a subscriber: all of them."""
 
 
 def key(topic: Topic, rig: str, **parts: str) -> str:
-    """The key of a topic. A part that is left out becomes ``*``: ``key(HEALTH, "rig0")`` is for a subscriber.
+    """The key of a topic. A part that is left out becomes ``*``: ``key(HEALTH, "rig0")`` is for a subscriber, and so
+    is ``key(VELOCITY, ANY_RIG)``.
 
     Raises ValueError for a part that the topic does not have, or that cannot be one part of a key.
     """
@@ -82,7 +85,7 @@ def key(topic: Topic, rig: str, **parts: str) -> str:
     for name, value in given.items():
         if name not in names:
             raise ValueError(f"topic {topic.name} has no part {name!r}")
-        if not value or _FORBIDDEN & set(value):
+        if not value or (_FORBIDDEN & set(value) and (name, value) != ("rig", ANY_RIG)):
             raise ValueError(f"{name} = {value!r}: must be one part of a key, without / * $ ? # or blanks")
     return topic.template.format(**{name: given.get(name, "*") for name in names})
 
