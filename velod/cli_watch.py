@@ -15,6 +15,7 @@ from velod.cli_exit import EXIT_FAILED
 from velod.cli_report import describe_attitude, describe_velocity
 from velod.client import Listener, Received
 from velod.config import ZenohSettings
+from velod.runtime.dispatching import SENT
 from velod.runtime.session import introducer_endpoint
 from velod.types import Health, Velocity
 from velod.wire.topics import ANY_RIG, HEALTH, ODOMETRY, TOPICS, VELOCITY, parts
@@ -169,7 +170,20 @@ def _lines(worker: str, received: Received | None, alive: bool) -> list[str]:
     )
     notes = [f"    {cause}: {n}" for cause, n in sorted({**gaps, **drops}.items())]
     alarms = [f"    ALARM {alarm}: {what}" for alarm, what in sorted(h.alarms.items())]
-    return [line, *notes, *alarms]
+    return [line, *shares(h.rates), *notes, *alarms]
+
+
+def shares(rates: dict[str, float]) -> list[str]:
+    """Who is sent how much of each stage's batches, by ingest's health: a line per stage."""
+    by_stage: dict[str, dict[str, float]] = {}
+    for name, rate in sorted(rates.items()):
+        if name.startswith(SENT):
+            worker = name.removeprefix(SENT)
+            by_stage.setdefault(worker.partition("-")[0], {})[worker] = rate
+    return [
+        f"    {stage}: " + ", ".join(f"{worker} {rate / sum(part.values()):.0%}" for worker, rate in part.items())
+        for stage, part in by_stage.items()
+    ]
 
 
 def _main_latency(h: Health) -> tuple[str, str, str]:

@@ -111,7 +111,9 @@ def test_losses_are_told_from_counts_of_work() -> None:
     assert drops == {"events.outside": 3, "wire.version_alien": 4, "error.KeyError": 5}
 
 
-def health(worker: str, age_s: float, **changes: dict[str, float] | dict[str, int] | dict[str, str]) -> Received:
+def health(
+    worker: str, age_s: float, **changes: dict[str, float] | dict[str, int] | dict[str, str] | str
+) -> Received:
     now_ns = time.time_ns()
     message = Health(0, 0, worker.split("-")[0], worker, 42, "host", "0.1.0", 12.0, **changes)  # type: ignore[arg-type]
     return Received(HEALTH, "key", Envelope(message, now_ns, 0), now_ns - int(age_s * 1e9), 100)
@@ -128,12 +130,17 @@ def test_the_table_tells_who_is_up_stale_gone_or_silent_and_what_they_lost() -> 
             alarms={"cpu": "too slow"},
         ),
         "optimizer-0": health("optimizer-0", 0.1),
-        "ingest-0": health("ingest-0", 60.0),
+        "optimizer-1": health("optimizer-1", 0.1, role="standby"),
+        "ingest-0": health("ingest-0", 60.0, rates={"sent.flow-0": 30.0, "sent.flow-1": 10.0, "sent.depth-0": 40.0}),
     }
-    text = table(Place("rig0", "tcp/h:1"), newest, [("flow", "flow-0"), ("depth", "depth-0")])
+    text = table(
+        Place("rig0", "tcp/h:1"), newest, [("flow", "flow-0"), ("depth", "depth-0"), ("optimizer", "optimizer-1")]
+    )
     rows = {line.split()[0]: line.split() for line in text.splitlines()[2:]}
     assert rows["flow-0"] == ["flow-0", "up", "42@host", "12", "50.0", "49.0", "1.25", "4.50", "2", "1", "stage"]
     assert (rows["optimizer-0"][1], rows["ingest-0"][1], rows["depth-0"][1]) == ("gone", "stale", "silent")
+    assert rows["optimizer-1"][1] == "standby"
+    assert "    flow: flow-0 75%, flow-1 25%\n" in text and "    depth: depth-0 100%\n" in text
     assert "    gap.batch_flow: 2" in text and "    wire.truncated: 1" in text and "    ALARM cpu: too slow" in text
 
 

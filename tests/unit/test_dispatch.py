@@ -68,6 +68,29 @@ def test_a_silent_worker_is_passed_over_until_it_finishes_something() -> None:
     assert d.counters == {"dispatch.expired": 1}
 
 
+def test_a_worker_that_hangs_is_not_waited_for_where_another_could_take_over() -> None:
+    d: Dispatcher[str] = Dispatcher(window=2, timeout_s=2.0, impatience_s=0.05)
+    d.join("flow-0", 0.0)
+    d.submit(0, "", 0.0)
+    assert d.expire(1.0) == []
+    d.join("flow-1", 1.0)
+    assert sent(d.expire(1.0)) == [("flow-1", 0)]
+
+
+def test_where_all_are_slow_nobody_is_taken_for_dead() -> None:
+    d: Dispatcher[str] = Dispatcher(window=1, timeout_s=2.0, impatience_s=0.05)
+    d.join("flow-0", 0.0)
+    d.join("flow-1", 0.0)
+    for i in range(100):
+        d.submit(2 * i, "", 0.1 * i)
+        d.submit(2 * i + 1, "", 0.1 * i)
+        d.done("flow-0", 2 * i, 0.1 * i + 0.09)
+        d.done("flow-1", 2 * i + 1, 0.1 * i + 0.09)
+    d.submit(200, "", 10.0)
+    assert d.expire(10.3) == []
+    assert d.counters == {}
+
+
 def test_the_only_worker_is_tried_again_after_a_lost_message() -> None:
     d: Dispatcher[str] = Dispatcher(window=1, timeout_s=1.0)
     d.join("flow-0", 0.0)

@@ -45,8 +45,13 @@ class Dispatcher(Generic[T]):
     longer than ``max_wait_s`` is dropped and counted as ``dispatch.stale``. What a worker had not finished when it
     left is sent to others, before newer batches (``dispatch.resent``). A worker that does not finish a batch in
     ``timeout_s`` is treated likewise (``dispatch.expired``), and then is given work only while there is nobody else,
-    until it finishes something: its message may have been lost, or it hangs.
+    until it finishes something: its message may have been lost, or it hangs. Where another worker could take over,
+    the limit is ``impatience_s``, or ``SLOW`` times as long as batches take if that is longer: a result that comes
+    after seconds is of no use.
     """
+
+    SLOW = 8.0
+    _SMOOTHING = 0.1  # of how long batches take
 
     def __init__(
         self,
@@ -54,6 +59,7 @@ class Dispatcher(Generic[T]):
         capacity: int | None = 64,
         timeout_s: float = math.inf,
         max_wait_s: float = math.inf,
+        impatience_s: float = math.inf,
     ) -> None:
         if window < 1 or (capacity is not None and capacity < 1) or not timeout_s > 0.0 or not max_wait_s > 0.0:
             raise ValueError("window and capacity must be at least 1, timeout_s and max_wait_s positive")
@@ -62,6 +68,8 @@ class Dispatcher(Generic[T]):
         self._capacity = capacity
         self._timeout_s = timeout_s
         self._max_wait_s = max_wait_s
+        self._impatience_s = impatience_s
+        self._typical_s = 0.0  # from sending a batch to its end
         self._workers: dict[str, _Worker[T]] = {}
         self._queue: deque[_Waiting[T]] = deque()
 
@@ -92,14 +100,16 @@ class Dispatcher(Generic[T]):
         """A worker has finished a batch; one that was given to another meanwhile changes nothing there."""
         known = self._workers.get(worker)
         if known is not None:
-            known.outstanding.pop(seq, None)
+            _, sent_s = known.outstanding.pop(seq, (None, now_s))
             known.silent = False
+            self._typical_s += self._SMOOTHING * (now_s - sent_s - self._typical_s)
         return self._assign(now_s)
 
     def expire(self, now_s: float) -> list[Assignment[T]]:
         """Call now and then: takes back what has been outstanding for too long."""
-        for worker in self._workers.values():
-            if any(now_s - sent_s > self._timeout_s for _, sent_s in worker.outstanding.values()):
+        for name, worker in self._workers.items():
+            limit_s = self._limit_s(name)
+            if any(now_s - sent_s > limit_s for _, sent_s in worker.outstanding.values()):
                 self._requeue(worker, "dispatch.expired", now_s)
                 worker.silent = True
         return self._assign(now_s)
@@ -124,6 +134,12 @@ class Dispatcher(Generic[T]):
         if (name := self._choose()) is None:
             return 0.0
         return now_s - min((sent_s for _, sent_s in self._workers[name].outstanding.values()), default=now_s)
+
+    def _limit_s(self, worker: str) -> float:
+        others = any(name != worker and not w.silent for name, w in self._workers.items())
+        return (
+            min(self._timeout_s, max(self._impatience_s, self.SLOW * self._typical_s)) if others else self._timeout_s
+        )
 
     def _requeue(self, worker: _Worker[T], why: str, now_s: float) -> None:
         unfinished = reversed(worker.outstanding.items())

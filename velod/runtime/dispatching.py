@@ -17,8 +17,13 @@ QUEUE = 64
 """Batches that wait while no worker is free; at 50 a second more than a second's worth."""
 TIMEOUT_S = 2.0
 """A worker that has not finished a batch by then has lost it, or hangs."""
+IMPATIENCE_S = 0.05
+"""Where another worker could take over: the optimizer waits for 60 ms."""
 MAX_WAIT_S = 0.5
 """A batch that has waited for longer is not sent any more: half the optimizer's window is over."""
+
+SENT = "sent."
+"""Begins the names of the counters of batches sent to each worker."""
 
 _TOPIC: dict[str, Topic] = {"flow": BATCH_FLOW, "depth": BATCH_DEPTH}
 
@@ -29,9 +34,12 @@ class BatchDispatch:
     def __init__(self, outlet: Outlet, lossless: bool) -> None:
         self._outlet = outlet
         self._dispatchers: dict[str, Dispatcher[bytes]] = {
-            stage: Dispatcher(WINDOW, None) if lossless else Dispatcher(WINDOW, QUEUE, TIMEOUT_S, MAX_WAIT_S)
+            stage: Dispatcher(WINDOW, None)
+            if lossless
+            else Dispatcher(WINDOW, QUEUE, TIMEOUT_S, MAX_WAIT_S, IMPATIENCE_S)
             for stage in _TOPIC
         }
+        self._sent: dict[str, int] = {}  # batches, by worker
 
     def send(self, batch: EventBatch | StereoBatch, t_origin_ns: int) -> None:
         """Give a batch to a worker now, or as soon as one is free."""
@@ -54,7 +62,7 @@ class BatchDispatch:
             self._put(token["stage"], change(token["worker"], time.monotonic()))
 
     def expire(self) -> None:
-        """Take back what has been outstanding for too long; call a few times a second."""
+        """Take back what has been outstanding for too long; call often."""
         for stage, dispatcher in self._dispatchers.items():
             self._put(stage, dispatcher.expire(time.monotonic()))
 
@@ -64,8 +72,11 @@ class BatchDispatch:
         return max(d.delay_s(now_s) for d in stages), max(len(d.waiting) for d in stages)
 
     def counters(self) -> dict[str, int]:
-        """Counters of both dispatchers, ``dispatch.overflow.flow`` and so on."""
-        return {f"{name}.{stage}": n for stage, d in self._dispatchers.items() for name, n in d.counters.items()}
+        """Counters of both dispatchers, ``dispatch.overflow.flow`` and so on, and of each worker, ``sent.flow-0``."""
+        counted = {f"{SENT}{worker}": n for worker, n in self._sent.items()}
+        for stage, dispatcher in self._dispatchers.items():
+            counted |= {f"{name}.{stage}": n for name, n in dispatcher.counters.items()}
+        return counted
 
     def alarms(self) -> dict[str, str]:
         """Stages without a worker."""
@@ -74,3 +85,4 @@ class BatchDispatch:
     def _put(self, stage: str, assignments: list[Assignment[bytes]]) -> None:
         for a in assignments:
             self._outlet.publish_bytes(_TOPIC[stage], a.batch, worker=a.worker)
+            self._sent[a.worker] = self._sent.get(a.worker, 0) + 1

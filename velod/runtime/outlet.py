@@ -57,8 +57,8 @@ class Outlet:
     def publish_bytes(self, topic: Topic, data: bytes, **parts: str) -> None:
         """Publish what has been encoded already."""
         self.publisher(topic, **parts).put(data, attachment=self._author)
-        name = f"out.{topic.name}"
-        self.counters[name] = self.counters.get(name, 0) + 1
+        for name, n in ((f"out.{topic.name}", 1), (f"bytes.{topic.name}", len(data))):
+            self.counters[name] = self.counters.get(name, 0) + n
 
     def publisher(self, topic: Topic, **parts: str) -> Any:
         """The publisher of one key, declared on first use."""

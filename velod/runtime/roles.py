@@ -97,9 +97,12 @@ class IngestShell(WorkerShell):
                 self.outlet.publish(IMU, output, t_origin_ns)
 
     def every_second(self) -> None:
-        """Health, and batches that nobody answered for."""
+        """Health, and what was shed."""
         self._load.end_period(self.stage.counters)
         super().every_second()
+
+    def every_round(self) -> None:
+        """Batches that nobody answered for."""
         self._dispatch.expire()
 
     def counters(self) -> dict[str, int]:
