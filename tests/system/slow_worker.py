@@ -41,7 +41,7 @@ def main() -> None:
     worker.start_logging(name)
     worker.prepare_process(0)
     stop = worker.stop_on_signals()
-    with open_session(ZenohSettings(connect=endpoint)) as session:
+    with open_session(ZenohSettings(connect=endpoint, insecure=True)) as session:
         settings, calibration = fetch(session, "rig0", endpoint)
         warm_up("flow", settings, calibration)
         stage = Slow(create_stage("flow", settings, calibration), float(ms) * 1e-3)
