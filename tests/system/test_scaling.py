@@ -49,7 +49,7 @@ def test_flow_workers_come_go_hang_and_are_slow_on_any_host_and_no_velocity_is_l
         it_is_back = shares(rig)
         near.send_signal(signal.SIGTERM)
         assert near.wait(10.0) == 0
-        time.sleep(1.2)
+        time.sleep(2.2)
         one_has_left = shares(rig)
         assert player.wait(30.0) == 0
     seen = rig.seen(consumer)

@@ -13,6 +13,7 @@ from velod.cli_play import Played, shortcomings
 from velod.cli_report import Line, describe_velocity, progress_bar, speed_and_sigma
 from velod.cli_watch import Place, describe, losses, table
 from velod.client import Received
+from velod.config import ZenohSettings
 from velod.eval.metrics import Metrics
 from velod.types import Health, ImuPacket, Message, Velocity
 from velod.wire import Envelope
@@ -134,7 +135,9 @@ def test_the_table_tells_who_is_up_stale_gone_or_silent_and_what_they_lost() -> 
         "ingest-0": health("ingest-0", 60.0, rates={"sent.flow-0": 30.0, "sent.flow-1": 10.0, "sent.depth-0": 40.0}),
     }
     text = table(
-        Place("rig0", "tcp/h:1"), newest, [("flow", "flow-0"), ("depth", "depth-0"), ("optimizer", "optimizer-1")]
+        Place("rig0", ZenohSettings(connect="tcp/h:1")),
+        newest,
+        [("flow", "flow-0"), ("depth", "depth-0"), ("optimizer", "optimizer-1")],
     )
     rows = {line.split()[0]: line.split() for line in text.splitlines()[2:]}
     assert rows["flow-0"] == ["flow-0", "up", "42@host", "12", "50.0", "49.0", "1.25", "4.50", "2", "1", "stage"]
