@@ -161,6 +161,7 @@ def _bench(args: argparse.Namespace) -> int:
 # --- the parser ---
 
 _SEQUENCES = "corridor-1..3, boxes-4..5, spin-1..3 (Table I of the paper)"
+_HELD_OUT = "walk-1 (in the hand, with stops), flip-1 (starts upside down), hover-1 (dashes, hovers and turns)"
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -363,10 +364,11 @@ def _add_sim(commands: _Commands[argparse.ArgumentParser]) -> None:
         "sim",
         _sim,
         "Simulate a recording: stereo events, IMU, truth.",
-        f"SEQUENCE: {_SEQUENCES}.",
+        f"SEQUENCE: {_SEQUENCES};\n{_HELD_OUT}, which no setting was chosen on.",
         "  velod sim corridor-1 -o corridor.h5 --seconds 5\n"
         "  velod sim boxes-4 -o boxes.h5 --seed 7 && velod eval boxes.h5 --offline\n"
         "  velod sim boxes-4 -o rough.h5 --noise 1 --leak 0.1 --bandwidth 300 --jitter 20 --imu-hz 1000\n"
+        "  velod sim hover-1 -o hover.h5 --texture 5 --seed 2\n"
         "  velod sim corridor-1 -o lens.h5 --distortion=-0.35,0.15,0,0,0",
     )
     parser.add_argument("sequence", metavar="SEQUENCE")

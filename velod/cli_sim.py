@@ -24,10 +24,11 @@ _EFFECTS: tuple[tuple[str, str, Callable[[str], object], str, str], ...] = (
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """IMU rate and real-sensor effects."""
+    """Texture, IMU rate, contrast threshold and real-sensor effects."""
     parser.add_argument(
         "--imu-hz", type=int, metavar="HZ", help="rate of the IMU, a divisor of 1,000,000 (default 200)"
     )
+    parser.add_argument("--texture", type=int, metavar="SEED", help="other leaves on walls and boxes")
     parser.add_argument("--threshold", type=float, metavar="C", help="contrast at which pixels fire (default 0.5)")
     group = parser.add_argument_group("real-sensor effects", "All off unless given.")
     group.add_argument(
@@ -45,7 +46,7 @@ def recipe_of(args: argparse.Namespace) -> Sequence:
     from velod.sim import sequence
     from velod.sim.effects import Effects
 
-    recipe = sequence(args.sequence)
+    recipe = sequence(args.sequence, args.texture)
     effects = Effects(radtan=args.distortion, **{field: getattr(args, field) for _, field, *_ in _EFFECTS})
     events, imu = recipe.events, recipe.imu
     if args.threshold is not None:

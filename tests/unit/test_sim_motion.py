@@ -11,13 +11,16 @@ import pytest
 from velod.geometry.camera import A_v, B_w
 from velod.geometry.so3 import exp, log
 from velod.io import open_recording, read_depth
-from velod.sim import TABLE_I, SequenceError, sequence, simulate, simulated_recording
+from velod.sim import HELD_OUT, TABLE_I, SequenceError, sequence, simulate, simulated_recording
 from velod.sim.imu import GRAVITY_W, ImuModel, sample_imu
+from velod.sim.recipe import BASELINE_M
 from velod.sim.render import Renderer
-from velod.sim.sequences import BASELINE_M, mean_motion
+from velod.sim.sequences import mean_motion
 from velod.sim.texture import Texture, TextureRecipe, make_texture
+from velod.sim.waves import Waves, integral, power, product
 
 NAMES = sorted(TABLE_I)
+OTHERS = sorted(HELD_OUT)
 MOMENTS = np.linspace(0.0, 20.0, 11)
 
 
@@ -31,7 +34,7 @@ def test_mean_speeds_are_those_of_table_1_within_2_percent(name: str) -> None:
     assert mean_motion(sequence(name).trajectory) == pytest.approx(TABLE_I[name], rel=0.02)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [*NAMES, *OTHERS])
 def test_velocities_and_accelerations_are_the_derivatives_of_the_poses(name: str) -> None:
     trajectory, h = sequence(name).trajectory, 1e-5
     before, now, after = (trajectory.at(MOMENTS + k * h) for k in (-1, 0, 1))
@@ -172,3 +175,66 @@ def test_a_damaged_recording_is_made_again(tmp_path: Path, monkeypatch: pytest.M
 def test_an_unknown_sequence_lists_the_known_ones() -> None:
     with pytest.raises(SequenceError, match=r"unknown sequence 'corridor'; known: corridor-1, .*spin-3"):
         sequence("corridor")
+
+
+# --- motions of other kinds ---
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_no_other_motion_comes_close_to_a_wall_or_a_box(name: str) -> None:
+    recipe = sequence(name)
+    p_WB = recipe.trajectory.at(np.linspace(0.0, 60.0, 6000)).p_WB
+    low, high = recipe.scene.shell[:3], recipe.scene.shell[3:]
+    assert (p_WB > low + 1.0).all() and (p_WB < high - 1.0).all()
+    reach = np.linalg.norm(recipe.scene.boxes[:, 3:6], axis=1)
+    assert (np.linalg.norm(p_WB[:, None] - recipe.scene.boxes[:, :3], axis=2) > reach + 0.7).all()
+
+
+def test_the_walk_stops_and_goes_on() -> None:
+    motion = sequence("walk-1").trajectory.at(np.arange(0.0, 40.0, 0.01))
+    speed = np.linalg.norm(motion.v_W, axis=1)
+    assert 0.3 < np.mean(speed < 0.05) < 0.5
+    assert speed.max() == pytest.approx(1.9, abs=0.1)
+
+
+def test_the_flip_starts_upside_down_and_comes_to_stand_upright() -> None:
+    down_W = sequence("flip-1").trajectory.at(np.arange(0.0, 20.0, 0.01)).R_WB[:, :, 1]
+    assert down_W[0, 2] > 0.9
+    assert down_W[:, 2].min() < -0.2
+
+
+def test_the_hover_turns_on_the_spot() -> None:
+    motion = sequence("hover-1").trajectory.at(np.arange(0.0, 40.0, 0.01))
+    speed, rate = np.linalg.norm(motion.v_W, axis=1), np.linalg.norm(motion.omega_B, axis=1)
+    assert speed.max() > 4.0
+    assert np.mean((speed < 0.3) & (rate > 1.0)) > 0.05
+
+
+def test_another_texture_changes_what_is_seen_and_not_the_motion() -> None:
+    plain, other = sequence("boxes-4"), sequence("boxes-4", texture_seed=9)
+    assert plain.trajectory == other.trajectory
+    assert (plain.texture.seed, other.texture.seed) == (1, 9)
+
+
+# --- sums of sines ---
+
+SOME = ((0.3, 1.7, 0.2), (-1.1, 0.4, 2.0), (0.7, 0.0, 0.5 * np.pi))
+MORE = ((0.9, 1.7, -0.4), (0.2, 5.0, 1.0))
+
+
+def value(waves: Waves, t: np.ndarray) -> np.ndarray:
+    return sum((a * np.sin(w * t + phase) for a, w, phase in waves), np.zeros_like(t))
+
+
+def test_products_and_powers_of_sums_of_sines_are_sums_of_sines() -> None:
+    t = np.linspace(-3.0, 9.0, 200)
+    assert np.allclose(value(product(SOME, MORE), t), value(SOME, t) * value(MORE, t), atol=1e-12)
+    assert np.allclose(value(power((1.3, 0.8, 0.3), 5), t), (1.3 * np.sin(0.8 * t + 0.3)) ** 5, atol=1e-12)
+    assert len(power((1.0, 0.8, 0.0), 6)) <= 5  # equal frequencies are one wave
+
+
+def test_the_integral_starts_where_it_is_told_and_has_its_sum_as_derivative() -> None:
+    t = np.linspace(0.0, 9.0, 200)
+    x, dx, _ = integral(SOME, start=2.5).at(t)
+    assert x[0] == pytest.approx(2.5)
+    assert np.allclose(dx, value(SOME, t), atol=1e-12)

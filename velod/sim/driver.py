@@ -24,13 +24,15 @@ MODEL_VERSION = 4
 """Raised with every change of the simulator that changes what it records."""
 
 
-def simulated_recording(name: str, seconds: float, seed: int, progress: Progress | None = None) -> Path:
+def simulated_recording(
+    name: str, seconds: float, seed: int, progress: Progress | None = None, texture_seed: int | None = None
+) -> Path:
     """Path of a recording of the sequence ``name``, simulated unless an equal one was before.
 
     Kept (3 bytes an event) in ``$VELOD_CACHE_DIR``, ``$XDG_CACHE_HOME/velod`` or ``~/.cache/velod``.
     Raises SequenceError, RecordingError.
     """
-    recipe = sequence(name)
+    recipe = sequence(name, texture_seed)
     digest = hashlib.sha256()
     _feed(digest, (MODEL_VERSION, recipe, float(seconds), seed))
     path = cache_directory() / f"{name}-{digest.hexdigest()[:16]}.h5"

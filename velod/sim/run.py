@@ -15,7 +15,7 @@ from velod.io.sequence import RecordingWriter
 from velod.sim.effects import Readout
 from velod.sim.event_camera import BLOCK_STEPS, MAX_MOTION_PX, STEPS, EventCamera
 from velod.sim.imu import sample_imu
-from velod.sim.sequences import BASELINE_M, Sequence
+from velod.sim.recipe import BASELINE_M, Sequence
 from velod.sim.texture import make_texture
 from velod.sim.trajectory import Trajectory
 from velod.types import F32, F64

@@ -1,22 +1,18 @@
-"""The synthetic sequences of Table I by name: scene, motion, sensors."""
+"""The simulated sequences by name: those of Table I, and others that no setting was chosen on."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import replace
 
 import numpy as np
 
-from velod.geometry.calibration import Calibration, Camera
-from velod.sim.effects import Effects
-from velod.sim.events import EventModel
-from velod.sim.imu import ImuModel
-from velod.sim.scene import Scene, corridor, room, scatter_boxes
+from velod.sim.held_out import HELD_OUT
+from velod.sim.recipe import Sequence
+from velod.sim.scene import corridor, room, scatter_boxes
 from velod.sim.texture import TextureRecipe
 from velod.sim.trajectory import Harmonics, Trajectory
 from velod.types import F64
-
-BASELINE_M = 0.12
 
 # Fast turns sweep more of it past a pixel: fewer, larger leaves keep the event rate in bounds.
 _ROOM_TEXTURE = TextureRecipe(leaves=1100, smallest_m=0.15, largest_m=1.0, darkest=0.12)
@@ -25,26 +21,6 @@ _SPIN_TEXTURE = TextureRecipe(leaves=500, smallest_m=0.22, largest_m=1.2, darkes
 
 class SequenceError(ValueError):
     """No sequence of that name; the text lists those that exist."""
-
-
-@dataclass(frozen=True, slots=True)
-class Sequence:
-    """All that decides what is recorded, but for length and seed."""
-
-    name: str
-    trajectory: Trajectory
-    scene: Scene
-    texture: TextureRecipe = field(default_factory=TextureRecipe)
-    events: EventModel = field(default_factory=EventModel)
-    effects: Effects = field(default_factory=Effects)
-    imu: ImuModel = field(default_factory=ImuModel)
-
-    @property
-    def calibration(self) -> Calibration:
-        """A pair of DAVIS346 that look the same way; left camera = body = IMU. Undistorted but for the effects."""
-        radtan = self.effects.radtan
-        camera = Camera(346, 260, 231.5, 231.5, 172.5, 129.5, "radtan" if radtan else "none", radtan)
-        return Calibration(camera, camera, np.eye(3), np.array([-BASELINE_M, 0.0, 0.0]))
 
 
 # Table I: mean linear (m/s) and angular (rad/s) velocity.
@@ -60,10 +36,22 @@ TABLE_I = {
 }
 
 
-def sequence(name: str) -> Sequence:
-    """The sequence ``name`` of TABLE_I. Raises SequenceError."""
-    if name not in TABLE_I:
-        raise SequenceError(f"unknown sequence {name!r}; known: {', '.join(TABLE_I)}")
+def all_names() -> tuple[str, ...]:
+    """Every sequence that there is."""
+    return (*TABLE_I, *HELD_OUT)
+
+
+def sequence(name: str, texture_seed: int | None = None) -> Sequence:
+    """The sequence ``name``, with other leaves on its walls where a seed is given. Raises SequenceError."""
+    if name not in all_names():
+        raise SequenceError(f"unknown sequence {name!r}; known: {', '.join(all_names())}")
+    recipe = HELD_OUT[name](name) if name in HELD_OUT else _of_table_i(name)
+    if texture_seed is None:
+        return recipe
+    return replace(recipe, texture=replace(recipe.texture, seed=texture_seed))
+
+
+def _of_table_i(name: str) -> Sequence:
     speed, rate = TABLE_I[name]
     kind = name.split("-")[0]
     if kind == "corridor":

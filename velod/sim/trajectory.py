@@ -12,13 +12,17 @@ from velod.types import F64
 _R_FB = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
+Wave = tuple[float, float, float]
+"""a, w (rad/s), phase (rad) of a sin(w t + phase)."""
+
+
 @dataclass(frozen=True, slots=True)
 class Harmonics:
     """x(t) = offset + rate t + sum of a sin(w t + phase) over ``waves`` of (a, w in rad/s, phase in rad)."""
 
     offset: float = 0.0
     rate: float = 0.0
-    waves: tuple[tuple[float, float, float], ...] = ()
+    waves: tuple[Wave, ...] = ()
 
     def at(self, t_s: F64) -> tuple[F64, F64, F64]:
         """x, dx/dt and d2x/dt2 at ``t_s`` (n,)."""

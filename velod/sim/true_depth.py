@@ -9,9 +9,10 @@ from velod.geometry.calibration import Calibration, Camera
 from velod.geometry.camera import normalised, undistort
 from velod.geometry.rectify import Rectification
 from velod.io.model import DepthTruth, Truth
+from velod.sim.recipe import Sequence
 from velod.sim.render import cast_shell_and_boxes
 from velod.sim.scene import Scene
-from velod.sim.sequences import TABLE_I, Sequence, sequence
+from velod.sim.sequences import all_names, sequence
 from velod.types import F32, F64, I64
 
 _SAME_M = 1e-3
@@ -60,7 +61,7 @@ def _cast_each(shell: F64, boxes: F64, R_WC: F64, p_WC: F64, rays: F32, depth: F
 
 def recipe_of(calibration: Calibration, truth: Truth, depth: DepthTruth | None) -> Sequence | None:
     """The sequence whose motion and first depth image a recording holds; None where it is none of today's."""
-    for name in TABLE_I:
+    for name in all_names():
         recipe = sequence(name)
         if _moves_so(recipe, truth) and depth is not None and _looks_so(recipe, calibration.left, depth):
             return recipe
