@@ -12,14 +12,16 @@ import math
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Any, Self
+
+import numpy as np
 
 from velod.config import ZenohSettings
 from velod.runtime.access import may_read
 from velod.runtime.inbox import Inbox
-from velod.runtime.measure import GapCounter
+from velod.runtime.measure import GapCounter, HostClocks
 from velod.runtime.session import SessionError, open_session
 from velod.types import Velocity
 from velod.wire import Envelope, WireError, decode
@@ -157,9 +159,11 @@ class VelocityClient:
     A context manager and an endless iterable of valid velocities (``valid_only=False``: of all), in order of sensor
     time. Reconnects by itself. Velocities older than ``max_age_s`` when they are handed out are discarded and counted
     as ``stale``, invalid ones as ``invalid``, and those of a time that was handed out already as ``repeated`` (a
-    stand-by that takes over may repeat one). Across hosts the age needs synchronised clocks; ``math.inf`` keeps
-    everything. ``tls/`` endpoints need ``keys``, a folder with certificates; ``tcp/`` ones on other hosts have to be
-    allowed with ``insecure``.
+    stand-by that takes over may repeat one). Each has the age at which it is handed out, ``age_ms``: NaN where it
+    cannot be known, because the publisher's clock is not in step with this host's (counted as ``age.unknown``; such
+    are not stale, whatever they are). ``max_age_s = math.inf`` keeps everything, as for a replay in slow motion.
+    ``tls/`` endpoints need ``keys``, a folder with certificates; ``tcp/`` ones on other hosts have to be allowed with
+    ``insecure``.
     """
 
     def __init__(
@@ -178,8 +182,9 @@ class VelocityClient:
         self.rig = rig
         self._max_age_s = max_age_s
         self._valid_only = valid_only
-        self._discarded: dict[str, int] = {}
+        self._counted: dict[str, int] = {}
         self._t_ns: dict[str, int] = {}  # by key: sensor time of the newest one handed out
+        self._clocks: dict[str, HostClocks] = {}  # by key
 
     def __enter__(self) -> Self:
         """Raises velod.runtime.session.SessionError: endpoint malformed, certificate of no use, TLS refused."""
@@ -200,27 +205,39 @@ class VelocityClient:
         deadline_s = time.monotonic() + timeout_s
         while (received := self._listener.receive(max(0.0, deadline_s - time.monotonic()))) is not None:
             velocity = received.envelope.message
-            # The age when it is handed out, not when it came in: it may have waited in the queue.
-            age_s = (time.time_ns() - received.envelope.t_pub_ns) * 1e-9
             if not isinstance(velocity, Velocity):
                 continue
+            way_ms = self._way_ms(received)
             newest_t_ns = self._t_ns.get(received.key, -CLOCK_RESTART_NS)
-            if age_s > self._max_age_s:
-                self._discard("stale")
+            # A publisher that does not know the age of what it sends leaves the way to be judged alone.
+            if np.nansum([velocity.age_ms, way_ms]) > 1e3 * self._max_age_s:
+                self._count("stale")
             elif newest_t_ns - CLOCK_RESTART_NS < velocity.t_ns <= newest_t_ns:
-                self._discard("repeated")
+                self._count("repeated")
             elif self._valid_only and not velocity.valid:
-                self._discard("invalid")
+                self._count("invalid")
             else:
                 self._t_ns[received.key] = velocity.t_ns
                 self.rig = parts(VELOCITY, received.key)["rig"]
-                return velocity
+                if math.isnan(age_ms := velocity.age_ms + way_ms):
+                    self._count("age.unknown")
+                return replace(velocity, age_ms=age_ms)
         return None
+
+    def _way_ms(self, received: Received) -> float:
+        """From publication to now, when it is handed out: it may have waited in the queue. NaN: not known."""
+        clocks = self._clocks.setdefault(received.key, HostClocks())
+        clocks.heard(received.envelope.t_pub_ns, received.t_received_ns)
+        now_ns = time.time_ns()
+        return (now_ns - received.envelope.t_pub_ns) * 1e-6 if clocks.agree(now_ns) else math.nan
 
     @property
     def counters(self) -> dict[str, int]:
-        """What was not handed out, by cause: stale, invalid, gap.velocity, restart.velocity, wire.*, ..."""
-        return {**self._listener.counters, **self._discarded}
+        """What was not handed out, by cause: stale, invalid, gap.velocity, restart.velocity, wire.*, ...
 
-    def _discard(self, why: str) -> None:
-        self._discarded[why] = self._discarded.get(why, 0) + 1
+        And what was, without an age: age.unknown.
+        """
+        return {**self._listener.counters, **self._counted}
+
+    def _count(self, why: str) -> None:
+        self._counted[why] = self._counted.get(why, 0) + 1

@@ -9,7 +9,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -50,8 +50,9 @@ class Service:
     def endpoint(self) -> str:
         return f"tcp/127.0.0.1:{self.port}"
 
-    def publish(self, seq: int, age_s: float = 0.0, valid: bool = True) -> None:
-        data = encode(velocity(seq, valid), time.time_ns() - int(age_s * 1e9))
+    def publish(self, seq: int, age_s: float = 0.0, valid: bool = True, age_ms: float = 0.0) -> None:
+        message = replace(velocity(seq, valid), age_ms=age_ms)
+        data = encode(message, time.time_ns() - int(age_s * 1e9))
         self.outlet.publish_bytes(VELOCITY, data)
 
 
@@ -94,6 +95,40 @@ def test_what_is_stale_invalid_lost_or_garbage_is_counted_and_not_handed_out(ser
     counters = client.counters
     assert (counters["stale"], counters["invalid"], counters["gap.velocity"]) == (1, 1, 3)
     assert counters["wire.truncated"] == 1 and sum(n for name, n in counters.items() if "wire." in name) == 2
+
+
+def test_the_age_runs_from_the_sensor_s_time_and_what_was_old_when_it_was_published_is_stale(
+    service: Service,
+) -> None:
+    with VelocityClient("rig0", connect=service.endpoint, max_age_s=1.0) as client:
+        heard(service)
+        service.publish(0, age_ms=1500.0)
+        service.publish(1, age_ms=30.0)
+        received = client.receive(5.0)
+    assert received is not None and received.seq == 1
+    assert 30.0 < received.age_ms < 1000.0
+    assert client.counters == {"stale": 1}
+
+
+def test_a_publisher_whose_clock_is_ahead_makes_the_age_unknown_and_that_is_said(service: Service) -> None:
+    with VelocityClient("rig0", connect=service.endpoint, max_age_s=1.0) as client:
+        heard(service)
+        service.publish(0, age_s=-0.5)
+        service.publish(1)
+        first, second = client.receive(5.0), client.receive(5.0)
+    assert first is not None and second is not None
+    assert math.isnan(first.age_ms) and math.isnan(second.age_ms)
+    assert client.counters == {"age.unknown": 2}
+
+
+def test_what_was_handed_out_once_is_not_handed_out_again(service: Service) -> None:
+    with VelocityClient("rig0", connect=service.endpoint, max_age_s=5.0) as client:
+        heard(service)
+        for seq in (0, 1, 1, 0, 2):
+            service.publish(seq)
+        received = [client.receive(5.0) for _ in range(3)]
+    assert [v.seq for v in received if v is not None] == [0, 1, 2]
+    assert client.counters["repeated"] == 2
 
 
 def test_all_velocities_are_handed_out_when_asked_for(service: Service) -> None:

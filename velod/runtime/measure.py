@@ -61,6 +61,31 @@ class SensorClock:
         return math.nan if self._offset_ns is None else (host_ns - self._offset_ns - t_ns) * 1e-6
 
 
+class HostClocks:
+    """Whether another host's clock agrees with this one's, by the times between sending and receiving.
+
+    A message cannot arrive before it was sent: one that does shows that the other clock is ahead. A clock that is
+    ahead by less than messages take shows nothing, and makes them look younger by no more than that. One that is
+    behind makes them look older than they are, which does no harm.
+    """
+
+    TOLERANCE_NS = 1_000_000
+    DOUBT_NS = 10_000_000_000
+    """Once caught, a clock is not trusted for so long."""
+
+    def __init__(self) -> None:
+        self._caught_ns: int | None = None
+
+    def heard(self, t_sent_ns: int, t_received_ns: int) -> None:
+        """One message, by the clocks of its sender and of this host."""
+        if t_received_ns < t_sent_ns - self.TOLERANCE_NS:
+            self._caught_ns = t_received_ns
+
+    def agree(self, now_ns: int) -> bool:
+        """Whether nothing speaks against it."""
+        return self._caught_ns is None or now_ns > self._caught_ns + self.DOUBT_NS
+
+
 class GapCounter:
     """Counts the messages that one stream lost, by their ``seq``.
 

@@ -226,7 +226,8 @@ class OptimizerShell(WorkerShell):
         """Hand the outputs over for publication, here or by another optimizer."""
         message = cause.message
         if isinstance(message, ImuSamples):
-            self._clock.heard(max(message.t_ns, message.event_t_ns), cause.t_origin_ns)
+            # By this host's clock, like the age below: ingest may run on another one.
+            self._clock.heard(max(message.t_ns, message.event_t_ns), time.time_ns())
         if isinstance(message, FlowBatch | DepthBatch):
             self._origin_ns[message.seq, message.t_ns] = cause.t_origin_ns
             if len(self._origin_ns) > self._REMEMBERED:
