@@ -7,13 +7,59 @@ from tests.synthetic import CALIBRATION, FLIGHT, messages
 from velod.config import ImuSettings, Settings, from_tree
 from velod.geometry.so3 import exp, hat
 from velod.optimizer.estimator import Estimator, Head
+from velod.optimizer.flow_equation import BIN_NS
+from velod.optimizer.interval import BLOCK, HEAD, Interval
 from velod.optimizer.preintegration import preintegrate
 from velod.optimizer.stage import OptimizerStage
-from velod.optimizer.window import BLOCK, HEAD, Window
+from velod.optimizer.window import Window
 from velod.types import ImuSamples, Velocity
 
 KNOT_NS = 100_000_000
 COMMON_SIGMA = np.array([0.004, 0.001, 0.003])
+
+
+def moment(t_ns, L, eta):
+    """An interval of one bin, of which the IMU says nothing: flows at ``t_ns``."""
+    interval = Interval(t_ns // BIN_NS * BIN_NS, t_ns // BIN_NS * BIN_NS + BIN_NS)
+    interval.flows.L[0], interval.flows.eta[0], interval.flows.total[0] = L, eta, (2.0, 2.0 * (t_ns % BIN_NS))
+    return interval
+
+
+def across_a_knot(window, rng):
+    """An interval of seven bins, some of them without flows, that begins in the last segment but one."""
+    knot = window.last * KNOT_NS
+    interval = Interval(knot - 13_000_000, knot + 17_000_000)
+    interval.until = interval.t_j
+    interval.blocks[:], interval.r[:] = rng.normal(size=(3, 15)), rng.normal(size=3)
+    root = rng.normal(size=(3, 3))
+    interval.information[:] = root @ root.T + np.eye(3)
+    interval.noise[:] = rng.normal(size=interval.noise.shape)
+    for k in (0, 2, 3, 5):
+        J = rng.normal(size=(12, 9)) * 30.0
+        interval.flows.L[k], interval.flows.eta[k] = J.T @ J, J.T @ rng.normal(size=12)
+        interval.flows.total[k] = 3.0, 3.0 * rng.uniform(0, BIN_NS)
+    return interval
+
+
+def dense_twin(window, interval):
+    """J^T J and J^T r of an interval on the states of the window, by dense algebra with the noise as states."""
+    noises = np.eye(interval.noise.shape[1])
+    n, m = window.size, len(noises)
+    J = interval.blocks[:, :12] @ window.selector(interval.t_i)
+    J = np.hstack([J + interval.blocks[:, 12:] @ window.spline_row(interval.until), interval.noise])
+    H, h = J.T @ interval.information @ J, J.T @ interval.information @ interval.r
+    H[n:, n:] += noises * (BIN_NS * 1e-9 / ImuSettings().gyro_noise ** 2)
+    for k in range(interval.flows.count):
+        weight, weighted_ns = interval.flows.total[k]
+        if weight:
+            t = (interval.flows.first + k) * BIN_NS + int(weighted_ns / weight)
+            common = np.eye(n)[window.common_columns(t // KNOT_NS)]
+            F = np.hstack([np.vstack([window.selector(t)[[0, 1, 2, 6, 7, 8]], common]), np.zeros((9, m))])
+            F[3:6, n:] = noises[3 * k : 3 * k + 3]
+            H += F.T @ interval.flows.L[k] @ F
+            h += F.T @ interval.flows.eta[k]
+    gain = np.linalg.solve(H[n:, n:], np.column_stack([H[n:, :n], h[n:]]))
+    return H[:n, :n] - H[:n, n:] @ gain[:, :-1], h[:n] - H[:n, n:] @ gain[:, -1]
 
 
 def filled(segments, rng):
@@ -24,9 +70,8 @@ def filled(segments, rng):
         if k:
             w.extend(exp(rng.normal(size=3)) * 0.1, rng.normal(size=3) * 10, rng.normal(size=3) * 0.01, 0.1)
         for _ in range(4):
-            t = int((k + rng.uniform(0, 1)) * KNOT_NS)
             J = rng.normal(size=(8, 9))
-            w.add_information(t, J.T @ J, J.T @ rng.normal(size=8))
+            w.add_interval(moment(int((k + rng.uniform(0, 1)) * KNOT_NS), J.T @ J, J.T @ rng.normal(size=8)))
     return w
 
 
@@ -51,12 +96,10 @@ def test_the_solution_in_the_envelope_is_that_of_dense_algebra(segments):
     rng = np.random.default_rng(3)
     w = filled(segments, rng)
     H, h = dense(w)
-    J, r, root = rng.normal(size=(3, w.size)), rng.normal(size=3), rng.normal(size=(3, 3))
-    J[:, : w.size - 60] = 0.0
-    g, information = np.array([1.0, -9.0, 3.0]), root @ root.T + np.eye(3)
-    solution = w.solve([(J, r, information)], g, 0.01)
-    H += J.T @ information @ J
-    h += J.T @ information @ r
+    interval, g = across_a_knot(w, rng), np.array([1.0, -9.0, 3.0])
+    solution = w.solve([interval], g, 0.01)
+    more, more_h = dense_twin(w, interval)
+    H, h = H + more, h + more_h
     direction, sigma = g / np.linalg.norm(g), 0.02 + 9.81 * 0.01**2
     newest = w.gravity_columns(w.last)
     H[np.ix_(newest, newest)] += np.outer(direction, direction) / sigma**2
@@ -104,25 +147,16 @@ def test_a_factor_adds_its_normal_equations():
     assert np.allclose(dense(w)[1], h + J.T @ information @ r)
 
 
-def test_information_of_a_moment_is_spread_by_the_spline():
+def test_an_interval_adds_imu_and_flows_with_their_noise_marginalised_as_dense_algebra_does():
     rng = np.random.default_rng(9)
     w = filled(4, rng)
     H, h = dense(w)
-    root, eta, t = rng.normal(size=(9, 9)), rng.normal(size=9), int(9.3 * KNOT_NS)
-    L = root @ root.T
-    w.add_information(t, L, eta)
-    common = np.eye(w.size)[w.common_columns(9)]
-    spread = np.vstack([w.selector(t)[[0, 1, 2, 6, 7, 8]], common])
-    assert np.allclose(dense(w)[0], H + spread.T @ L @ spread)
-    assert np.allclose(dense(w)[1], h + spread.T @ eta)
-
-
-def test_blocks_between_two_moments_are_spread_over_their_control_points():
-    w = filled(4, np.random.default_rng(9))
-    blocks = np.random.default_rng(1).normal(size=(3, 15))
-    t_i, t_j = int(9.95 * KNOT_NS), int(10.2 * KNOT_NS)
-    twin = blocks[:, :12] @ w.selector(t_i) + blocks[:, 12:] @ w.spline_row(t_j)
-    assert np.allclose(w.between(t_i, t_j, blocks), twin, atol=1e-15)
+    interval = across_a_knot(w, rng)
+    more, more_h = dense_twin(w, interval)
+    w.add_interval(interval)
+    scale = np.abs(more).max()
+    assert np.allclose(dense(w)[0] - H, more, atol=1e-9 * scale)
+    assert np.allclose(dense(w)[1] - h, more_h, atol=1e-9 * scale)
 
 
 def test_the_window_keeps_its_size():
@@ -161,13 +195,19 @@ def estimator(request):
     a = 15 * np.cos(t[:, None] * 1e-9 * np.array([5.0, 8.0, 6.0])) + rng.normal(size=3)
     e.add_imu(ImuSamples(0, int(t[-1]), 0, -1, 0, t, a, w))
     e.memory.integrate_to(600_000_000, np.zeros(3), np.zeros(3))
-    e.window.start(0)
+    e._start(0)
     e._extend_to(250_000_000)
     b_a, b_w = np.array([0.1, -0.2, 0.15]), np.array([0.02, -0.03, 0.01])
     R_LB = e.memory.at(np.array([250_000_000]))[0][0]
     g_L = np.array([1.0, -9.0, 3.0])
     e.head = Head(250_000_000, np.array([3.0, -1.0, 2.0]), b_a, b_w, g_L, R_LB, np.eye(12) * 1e-4, np.zeros(3))
     return e
+
+
+def linearised(e, t_i, t_j):
+    interval = Interval(t_i, t_j)
+    e._linearise(interval, t_j)
+    return interval
 
 
 def residual(e, x, t_i, t_j):
@@ -185,29 +225,39 @@ def residual(e, x, t_i, t_j):
 
 def test_the_inertial_factor_is_the_derivative_of_the_residual(estimator):
     e, (t_i, t_j) = estimator, (255_000_000, 280_000_000)
-    J, r, information = e._inertial_factor(t_i, t_j)
+    interval = linearised(e, t_i, t_j)
     predicted, _ = e.predict(t_j)
     F, G = e.window.selector(t_i), e.window.spline_row(t_j)
+    J = interval.blocks[:, :12] @ F + interval.blocks[:, 12:] @ G
     # a state at the factor's linearisation: biases of the head, velocity at t_j as predicted
     _, N_j, M_j = e._frame(t_j)
     x = F[3:6].T @ e.head.b_a + F[6:9].T @ e.head.b_w + F[9:12].T @ e.head.g_L
     x = x + G.T @ np.linalg.solve(G @ G.T, np.linalg.solve(M_j, predicted - N_j))
-    assert np.allclose(J @ x - r, residual(e, x, t_i, t_j), atol=1e-9)
+    assert np.allclose(J @ x - interval.r, residual(e, x, t_i, t_j), atol=1e-9)
     h = 1e-6
     for column in np.flatnonzero(J.any(axis=0)):
         d = np.zeros(len(x))
         d[column] = h
         numeric = (residual(e, x + d, t_i, t_j) - residual(e, x - d, t_i, t_j)) / (2 * h)
         assert np.allclose(J[:, column], numeric, atol=1e-6), column
-    assert np.all(np.linalg.eigvalsh(information) > 0)
+    assert np.all(np.linalg.eigvalsh(interval.information) > 0)
 
 
-def test_the_factors_information_is_that_of_the_imus_noise(estimator):
+def test_a_noise_that_lasts_is_a_bias(estimator):
+    """Equal in all bins, the gyroscope's noise does to the residual what b_w does."""
+    interval = linearised(estimator, 255_000_000, 280_000_000)
+    total = interval.noise.reshape(3, -1, 3).sum(axis=1)
+    assert np.allclose(total, interval.blocks[:, 6:9], atol=0.01 * np.abs(total).max())
+
+
+def test_without_flows_an_interval_weighs_what_the_imus_noise_leaves(estimator):
     e, (t_i, t_j) = estimator, (255_000_000, 280_000_000)
-    _, _, information = e._inertial_factor(t_i, t_j)
+    interval = linearised(e, t_i, t_j)
     p, (v_j, _) = e._preintegrate(t_i, t_j, e.head.b_a, e.head.b_w), e.predict(t_j)
     G = np.hstack([p.R_gamma @ hat(v_j), np.eye(3)])
-    assert np.allclose(information, np.linalg.inv(G @ p.cov @ G.T + np.eye(3) * 1e-6), rtol=1e-9)
+    covariance = G @ p.cov @ G.T + np.eye(3) * 1e-6
+    noise = interval.noise @ interval.noise.T * (Settings().imu.gyro_noise ** 2 / (BIN_NS * 1e-9))
+    assert np.allclose(np.linalg.inv(interval.information) + noise, covariance, atol=0.02 * np.abs(covariance).max())
 
 
 def test_the_velocity_is_carried_by_eq_10(estimator):

@@ -6,6 +6,7 @@ from velod.geometry.camera import motion_field_rows
 from velod.geometry.so3 import exp
 from velod.optimizer.flow_equation import (
     COMMON,
+    Bins,
     Measured,
     Rows,
     body_rows,
@@ -65,33 +66,30 @@ def test_the_same_seed_gives_the_same_bits():
 
 
 def test_compression_loses_nothing_of_velocity_bias_and_common_errors():
-    """The bins add up to the normal equations of all rows, when the gyroscope is perfect."""
+    """The bins add up to the normal equations of all rows."""
     rng = np.random.default_rng(8)
     rows = rows_of(np.array([2.0, -1.0, 1.0]), np.array([0.02, 0.01, -0.03]), rng)
     fit = solve(rows, 64, 1)
     c = rng.normal(size=(len(rows.z), 3)) * 50
-    infos = compress(rows, c, fit, bin_ns=5_000_000, gyro_noise=1e-9, shared_error=1.0)
-    J = np.hstack([rows.a, -rows.b, c]) * (np.sqrt(fit.weight) / rows.sigma / fit.scale)[:, None]
-    assert len(infos) == 4
-    assert np.allclose(sum(i.L for i in infos), J.T @ J, rtol=1e-6, atol=1e-6)
-    assert all(np.min(rows.t_ns) <= i.t_ns <= np.max(rows.t_ns) for i in infos)
+    bins = compress(rows, c, fit, shared_error=2.0)
+    J = np.hstack([rows.a, -rows.b, c]) * (np.sqrt(fit.weight / 2.0) / rows.sigma / fit.scale)[:, None]
+    weighted_z = rows.z * np.sqrt(fit.weight / 2.0) / rows.sigma / fit.scale
+    assert bins.count == 4
+    assert np.allclose(bins.L.sum(axis=0), J.T @ J, rtol=1e-9)
+    assert np.allclose(bins.eta.sum(axis=0), J.T @ weighted_z, rtol=1e-9)
+    first_bin = rows.t_ns < 5_000_000
+    w = (fit.weight / rows.sigma**2)[first_bin]
+    assert np.isclose(bins.t_ns[0], (w @ rows.t_ns[first_bin]) / w.sum(), atol=1)
 
 
-def test_the_gyroscopes_noise_is_marginalised_as_dense_algebra_does():
-    rng = np.random.default_rng(8)
-    rows = rows_of(np.ones(3), np.zeros(3), rng)
-    one_bin = Rows(rows.t_ns % 5_000_000, rows.z, rows.a, rows.b, rows.sigma)
-    fit = solve(one_bin, 64, 1)
-    c = rng.normal(size=(len(rows.z), 3)) * 50
-    (info,) = compress(one_bin, c, fit, 5_000_000, gyro_noise=1.86e-3, shared_error=5.0)
-    # dense: z = [a, -b] x - b n_w + noise: correlated noise of all rows
-    w = fit.weight > 0
-    W_inv = np.diag(((rows.sigma * fit.scale) ** 2 / np.maximum(fit.weight, 1e-300) * 5.0)[w])
-    b = rows.b[w]
-    covariance = W_inv + b @ b.T * 1.86e-3**2 / 5e-3
-    J = np.hstack([rows.a, -rows.b, c])[w]
-    assert np.allclose(info.L, J.T @ np.linalg.solve(covariance, J), rtol=1e-5, atol=1e-6)
-    assert np.allclose(info.eta, J.T @ np.linalg.solve(covariance, rows.z[w]), rtol=1e-5, atol=1e-5)
+def test_bins_add_to_those_of_the_same_number_and_to_no_others():
+    whole, part = Bins(10, 6), Bins(8, 5)
+    part.L[:], part.eta[:], part.total[:] = 1.0, 2.0, 3.0
+    whole.add(part, stop=12)
+    assert [whole.L[k, 0, 0] for k in range(6)] == [1.0, 1.0, 0.0, 0.0, 0.0, 0.0]
+    assert whole.eta[1, 3] == 2.0 and whole.total[0, 1] == 3.0
+    whole.add(part, stop=9)
+    assert whole.L.sum() == 2 * 81
 
 
 def test_the_rows_of_a_displaced_and_turned_camera_are_differences_of_its_flow():

@@ -24,9 +24,10 @@ from velod.events.plane_fit import SIZE
 from velod.events.sae import new_surface, update_sae
 from velod.flow.stage import FlowStage
 from velod.ingest.stage import IngestStage
-from velod.optimizer.estimator import BIN_NS, Estimator
+from velod.optimizer.estimator import Estimator
 from velod.optimizer.flow_equation import Fit, Rows, body_rows, compress, on_velocity, solve
-from velod.optimizer.window import BLOCK, Window
+from velod.optimizer.interval import BLOCK
+from velod.optimizer.window import Window
 from velod.types import (
     F64,
     NS_PER_S,
@@ -231,9 +232,10 @@ def window(size: Size) -> Case:
         rows, fit = batches[-1]
         H, _ = dense_normal_equations(still.window, batches[-1:])
         compressed = np.zeros_like(H)
-        for info in compress(rows, np.zeros((len(rows.z), 3)), fit, BIN_NS, 1e-9, 1.0):
-            at = still.window.selector(info.t_ns)[_V_AND_BW]
-            compressed += at.T @ info.L[:6, :6] @ at
+        bins = compress(rows, np.zeros((len(rows.z), 3)), fit, 1.0)
+        for t_ns, L in zip(bins.t_ns, bins.L, strict=True):
+            at = still.window.selector(t_ns)[_V_AND_BW]
+            compressed += at.T @ L[:6, :6] @ at
         return float(np.abs(compressed - H).max() / np.abs(H).max())
 
     return Case("solve.window", run, 1, "dense numpy of all rows", run_peer, 1, disagreement, slow=True)

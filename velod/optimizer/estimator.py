@@ -10,19 +10,20 @@ import numpy as np
 from velod.config import Settings
 from velod.geometry.calibration import Calibration
 from velod.geometry.rectify import rectify
-from velod.geometry.so3 import log
+from velod.geometry.so3 import hat, log
 from velod.optimizer import attitude, flow_equation, inertial_residual
 from velod.optimizer.attitude import Attitude
-from velod.optimizer.flow_equation import Fit, Measured, Rows
+from velod.optimizer.flow_equation import BIN_NS, Bins, Fit, Measured, Rows
 from velod.optimizer.inertial import InertialMemory
+from velod.optimizer.interval import Interval
 from velod.optimizer.preintegration import Preintegration, preintegrate
 from velod.optimizer.spline import locate
 from velod.optimizer.standstill import QUIET_NS, Standstill
 from velod.optimizer.window import Window
 from velod.types import F64, I64, NS_PER_S, DepthBatch, FlowBatch, ImuSamples
 
-BIN_NS = 5_000_000
-"""Flows this close in time share one gyroscope noise (DESIGN 5, item 6)."""
+OPEN_NS = 60_000_000
+"""An interval is open so long for flows of batches to come, which select events up to half the memory old."""
 SMOOTHNESS = {"error": 0.5, "velocity": 5.0}
 """Weak sigma of the second difference of control points, m/s, by what the spline models."""
 INNOVATION_GATE = 25.0
@@ -96,7 +97,7 @@ class Estimator:
         self.head: Head | None = None
         self.batches = 0  # that gave a velocity
         self.last_usable_t_ns = 0
-        self._preintegrated_to = 0
+        self._open: list[Interval] = []  # that may get flows yet; the last one is incomplete
         # t_ns -> the IMU up to there and the prediction, from the head ``_carried_from``
         self._carried: dict[int, tuple[Preintegration, F64, F64]] = {}
         self._carried_from: Head | None = None
@@ -108,7 +109,7 @@ class Estimator:
     def absorb(self, flow: FlowBatch, depth: DepthBatch) -> None:
         """Take a batch in; the IMU must cover its end. A batch older than the head adds what it knows."""
         self.memory.integrate_to(flow.t_ns, *self._biases())
-        if not self.window.empty and not self.memory.covers(self._preintegrated_to, flow.t_ns):
+        if not self.window.empty and not self.memory.covers(self._open[-1].t_i, flow.t_ns):
             self._count("estimate.restart_after_hole")
             self._forget()
         equations = self._equations(flow, depth)
@@ -160,9 +161,12 @@ class Estimator:
     def _count(self, name: str) -> None:
         self.counters[name] = self.counters.get(name, 0) + 1
 
-    def _preintegrate(self, t_i: int, t_j: int, b_a: F64, b_w: F64) -> Preintegration:
-        m = self.memory
-        return preintegrate(m.t_ns, m.accel, m.gyro, t_i, t_j, b_a, b_w, self._imu.accel_noise, self._imu.gyro_noise)
+    def _preintegrate(
+        self, t_i: int, t_j: int, b_a: F64, b_w: F64, gyro_noise: float | None = None
+    ) -> Preintegration:
+        m, imu = self.memory, self._imu
+        noise = imu.gyro_noise if gyro_noise is None else gyro_noise
+        return preintegrate(m.t_ns, m.accel, m.gyro, t_i, t_j, b_a, b_w, imu.accel_noise, noise)
 
     def _common(self, on_velocity: Rows, on_error: Rows, measured: Measured) -> F64:
         """Rows (m, 3) of the errors that all flows have in common; 0 before anything is known of the velocity.
@@ -240,7 +244,7 @@ class Estimator:
 
     def _start(self, t_ns: int) -> None:
         self.window.start(t_ns)
-        self._preintegrated_to = t_ns
+        self._open = [self._interval_from(t_ns)]
 
     def _extend_to(self, t_ns: int) -> None:
         """Open segments and add the inertial factors of the complete preintegration intervals up to ``t_ns``."""
@@ -251,30 +255,44 @@ class Estimator:
             R, _, _ = self.memory.at(np.maximum(times, self.memory.t_ns[0]))
             D_L = np.asarray(R.mean(axis=0)) * self._o.knot_s
             self.window.extend(D_L, g_L, self._biases()[1], self._o.knot_s)
-            self._inertial_factors_to(min(t_ns, end + self._knot_ns))
-        self._inertial_factors_to(t_ns)
+            self._intervals_to(min(t_ns, end + self._knot_ns))
+        self._intervals_to(t_ns)
 
-    def _inertial_factors_to(self, t_ns: int) -> None:
-        while True:
-            t_i = self._preintegrated_to
-            t_j = (t_i // self._interval_ns + 1) * self._interval_ns
-            if t_j > t_ns or not self.window.contains(t_j):
-                return
-            self.window.add(*self._inertial_factor(t_i, t_j))
-            self._preintegrated_to = t_j
+    def _interval_from(self, t_i: int) -> Interval:
+        return Interval(t_i, (t_i // self._interval_ns + 1) * self._interval_ns)
+
+    def _intervals_to(self, t_ns: int) -> None:
+        """Complete the intervals up to ``t_ns``, and close those that are old enough."""
+        while (t_j := self._open[-1].t_j) <= t_ns and self.window.contains(t_j):
+            self._linearise(self._open[-1], t_j)
+            self._open.append(self._interval_from(t_j))
+        while self._open[0].t_j <= t_ns - OPEN_NS and len(self._open) > 1:
+            self.window.add_interval(self._open.pop(0))
 
     def _gravity(self) -> F64:
         return np.zeros(3) if self.head is None else self.head.g_L
 
-    def _inertial_factor(self, t_i: int, t_j: int) -> tuple[F64, F64, F64]:
-        """(J, r, information) of Eq. 14's inertial residual over [t_i, t_j], in the frame B_i."""
-        p = self._preintegrate(t_i, t_j, *self._biases())
+    def _linearise(self, interval: Interval, t_j: int) -> None:
+        """Eq. 14's inertial residual over [t_i, ``t_j``], in the frame B_i, its gyroscope noise by bins."""
+        t_i, interval.until = interval.t_i, t_j
+        p = self._preintegrate(t_i, t_j, *self._biases(), gyro_noise=0.0)
         R_LBi, N_i, M_i = self._frame(t_i)
         _, N_j, M_j = self._frame(t_j)
-        predicted = self.predict(t_j) if self.head is not None and t_j >= self.head.t_ns else None
-        v_j = predicted[0] if predicted is not None else (np.zeros(3) if self.head is None else self.head.v_B)
-        blocks, r, information = inertial_residual.linearise(p, R_LBi, (N_i, M_i), (N_j, M_j), v_j)
-        return self.window.between(t_i, t_j, blocks), r, information
+        head = self.head
+        predicted = self.predict(t_j) if head is not None and t_j >= head.t_ns else None
+        v_j = predicted[0] if predicted is not None else (np.zeros(3) if head is None else head.v_B)
+        interval.blocks, interval.r, interval.information = inertial_residual.linearise(
+            p, R_LBi, (N_i, M_i), (N_j, M_j), v_j
+        )
+        if head is not None:
+            edges = interval.bin_edges()
+            middles = (edges[:-1] + edges[1:]) // 2
+            R_LB, s_L, _ = self.memory.at(middles)
+            # R_kj v_j - beta_kj
+            v_L = s_L + self._e(middles, head) - head.g_L * ((t_j - middles) * 1e-9)[:, None]
+            # a rate n for dt turns what follows: -R_ik [v_k]x dt n = -[v]x R_ik dt n, v in the frame B_i
+            turned = -hat(v_L @ R_LBi) @ (R_LBi.T @ R_LB) * (np.diff(edges) * 1e-9)[:, None, None]
+            interval.noise[:] = turned.transpose(1, 0, 2).reshape(3, -1)
 
     def _add_flow(self, t_ns: int, equations: Equations, predicted: tuple[F64, F64] | None) -> None:
         fit = self._fit(t_ns, equations)
@@ -287,10 +305,19 @@ class Estimator:
         if shared > self._o.shared_error:
             self._count("fit.inconsistent")
         rows, common = equations.on_spline, equations.common
-        for info in flow_equation.compress(rows, common, fit, BIN_NS, self._imu.gyro_noise, shared):
-            self.window.add_information(info.t_ns, info.L, info.eta)
+        self._share_out(flow_equation.compress(rows, common, fit, shared))
         self.batches += 1
         self.last_usable_t_ns = max(self.last_usable_t_ns, t_ns)
+
+    def _share_out(self, bins: Bins) -> None:
+        """Give each bin to the interval that it begins in, or to the window where that is closed."""
+        upto = [interval.flows.first for interval in self._open[1:]]
+        for interval, stop in zip(self._open, [*upto, bins.first + bins.count], strict=True):
+            interval.flows.add(bins, stop)
+        for k in range(bins.first, min(self._open[0].flows.first, bins.first + bins.count)):
+            alone = Interval(k * BIN_NS, (k + 1) * BIN_NS)
+            alone.flows.add(bins, k + 1)
+            self.window.add_interval(alone)
 
     def _add_standstill(self, t_ns: int) -> None:
         """v_B = 0 at ``t_ns``, as an observation."""
@@ -314,16 +341,17 @@ class Estimator:
             if np.linalg.norm(s_L[0]) > MAX_INTEGRATED:
                 self.memory.shift(-s_L[0])
                 self.window.shift(s_L[0])
+                for interval in self._open:
+                    interval.shift(s_L[0])
 
     def _solve_head(self, t_ns: int) -> None:
         """Optimum of the window and the state at ``t_ns``, with the IMU of the last incomplete interval."""
-        extra = []
-        if t_ns > self._preintegrated_to:
-            extra.append(self._inertial_factor(self._preintegrated_to, t_ns))
+        if t_ns > self._open[-1].t_i:
+            self._linearise(self._open[-1], t_ns)
         g_prior, g_sigma = None, 0.0
         if self.head is not None and (sigma := self.head.gravity_direction_sigma) < MAX_DIRECTION_SIGMA:
             g_prior, g_sigma = self.head.g_L, sigma
-        solution = self.window.solve(extra, g_prior, g_sigma)
+        solution = self.window.solve(self._open, g_prior, g_sigma)
         F = self.window.selector(t_ns)
         R_LB, N, M = self._frame(t_ns)
         x = F @ solution.x

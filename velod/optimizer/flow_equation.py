@@ -10,7 +10,6 @@ rows in the frame of the estimated error e. Robust weights come from the batch's
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +19,8 @@ from velod.events.columns import readonly
 from velod.geometry.camera import motion_field_rows
 from velod.types import F32, F64, I64, U16
 
+BIN_NS = 5_000_000
+"""Flows this close in time share one gyroscope noise (DESIGN 5, item 6)."""
 PREDICTED_SHARE = (0.3, 3.0)
 """Bounds on predicted over measured flow where a sigma is scaled by it."""
 COMMON = ("flow scale", "delay", "depth scale")
@@ -61,13 +62,31 @@ class Fit:
     inliers: float  # share of rows with a weight
 
 
-@dataclass(frozen=True, slots=True)
-class Information:
-    """Of [e, b_w, common errors] at one moment: x^T L x / 2 - eta^T x."""
+class Bins:
+    """Information x^T L x / 2 - eta^T x on x = [e, b_w, common], by bins of BIN_NS of time.
 
-    t_ns: int
-    L: F64  # (9, 9)
-    eta: F64  # (9,)
+    ``count`` bins from number ``first`` on: bin k is [k BIN_NS, (k + 1) BIN_NS).
+    """
+
+    def __init__(self, first: int, count: int) -> None:
+        self.first, self.count = first, count
+        self.L = np.zeros((count, 9, 9))
+        self.eta = np.zeros((count, 9))
+        self.total = np.zeros((count, 2))  # weight, and weighted time since the start of the bin, ns
+
+    @property
+    def t_ns(self) -> list[int]:
+        """Mean time of what is in each bin; the start of an empty one."""
+        return [(self.first + k) * BIN_NS + int(wt / max(w, 1e-300)) for k, (w, wt) in enumerate(self.total)]
+
+    def add(self, other: Bins, stop: int) -> None:
+        """Add the bins of ``other`` that are among these and below number ``stop``."""
+        start, stop = max(self.first, other.first), min(stop, self.first + self.count, other.first + other.count)
+        if start < stop:
+            own, its = (slice(start - bins.first, stop - bins.first) for bins in (self, other))
+            self.L[own] += other.L[its]
+            self.eta[own] += other.eta[its]
+            self.total[own] += other.total[its]
 
 
 def body_rows(
@@ -158,27 +177,18 @@ def solve_weighted(rows: Rows, measured: Measured, iterations: int, seed: int) -
     return solve(rows, iterations, seed)
 
 
-def compress(rows: Rows, c: F64, fit: Fit, bin_ns: int, gyro_noise: float, shared_error: float) -> list[Information]:
-    """The rows of each ``bin_ns`` as one Information, the gyroscope's noise of the moment marginalised out.
+def compress(rows: Rows, c: F64, fit: Fit, shared_error: float) -> Bins:
+    """The rows, with those of ``common`` ``c`` (m, 3), as information in bins.
 
-    That noise moves all flows of a moment together: a nuisance n_w of variance gyro_noise^2 / bin, which enters as
-    b_w does. ``c`` (m, 3) are the rows of ``common``. ``shared_error`` divides the information of the flows, for
-    errors that they share within a batch.
+    ``shared_error`` divides the information of the flows, for errors that they share within a batch.
     """
-    first = int(rows.t_ns.min()) // bin_ns
-    count = int(rows.t_ns.max()) // bin_ns - first + 1
-    L, eta, total, t_ns = (
-        np.zeros((count, 9, 9)),
-        np.zeros((count, 9)),
-        np.zeros((count, 2)),
-        np.empty(count, np.int64),
-    )
-    noise_information = bin_ns * 1e-9 / gyro_noise**2
+    first = int(rows.t_ns.min()) // BIN_NS
+    bins = Bins(first, int(rows.t_ns.max()) // BIN_NS - first + 1)
     _compress(
         rows.t_ns, rows.z, rows.a, rows.b, c, rows.sigma, fit.weight, fit.scale**2 * shared_error,
-        first, bin_ns, noise_information, total, t_ns, L, eta,
+        first, bins.total, bins.L, bins.eta,
     )  # fmt: skip
-    return [Information(int(t_ns[k]), L[k], eta[k]) for k in range(count) if total[k, 0] > 0.0]
+    return bins
 
 
 @njit(cache=True, nogil=True)
@@ -232,60 +242,25 @@ def _compress(
     weight: F64,
     variance: float,
     first: int,
-    bin_ns: int,
-    noise_information: float,
     total: F64,
-    t_out: I64,
     L: F64,
     eta: F64,
 ) -> None:
-    """Per bin: weights and weighted times into ``total``, their mean time, and L and eta without the nuisance."""
     row = np.empty(9)
     for k in range(z.size):
         if not weight[k] > 0.0:
             continue
         w = weight[k] / (sigma[k] * sigma[k] * variance)
-        at = t_ns[k] // bin_ns - first
+        at = t_ns[k] // BIN_NS - first
         total[at, 0] += w
-        total[at, 1] += w * (t_ns[k] - (at + first) * bin_ns)
+        total[at, 1] += w * (t_ns[k] - (at + first) * BIN_NS)
         for i in range(3):
             row[i], row[3 + i], row[6 + i] = a[k, i], -b[k, i], c[k, i]
         for i in range(9):
             wi = w * row[i]
             eta[at, i] += wi * z[k]
-            for j in range(i, 9):
+            for j in range(9):
                 L[at, i, j] += wi * row[j]
-    for at in range(len(total)):
-        if total[at, 0] > 0.0:
-            t_out[at] = (at + first) * bin_ns + int(total[at, 1] / total[at, 0])
-            _marginalise_nuisance(L[at], eta[at], noise_information)
-
-
-@njit(cache=True, nogil=True)
-def _marginalise_nuisance(L: F64, eta: F64, noise_information: float) -> None:
-    """L - K S^-1 K^T and eta - K S^-1 eta_b, with K the columns of b_w and S their block plus the noise's.
-
-    ``L`` (9, 9) comes as its upper triangle and leaves whole. S is factorised C C^T; G = C^-1 [K^T, eta_b].
-    """
-    for i in range(9):
-        for j in range(i):
-            L[i, j] = L[j, i]
-    C, G = np.zeros((3, 3)), np.empty((3, 10))
-    for i in range(3):
-        for j in range(i + 1):
-            s = L[3 + i, 3 + j] + (noise_information if i == j else 0.0)
-            for q in range(j):
-                s -= C[i, q] * C[j, q]
-            C[i, j] = math.sqrt(s) if i == j else s / C[j, j]
-        for c in range(10):
-            g = L[3 + i, c] if c < 9 else eta[3 + i]
-            for q in range(i):
-                g -= C[i, q] * G[q, c]
-            G[i, c] = g / C[i, i]
-    for i in range(9):
-        eta[i] -= G[0, i] * G[0, 9] + G[1, i] * G[1, 9] + G[2, i] * G[2, 9]
-        for j in range(9):
-            L[i, j] -= G[0, i] * G[0, j] + G[1, i] * G[1, j] + G[2, i] * G[2, j]
 
 
 @njit(cache=True, nogil=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 
 from velod.types import F64
 
@@ -12,14 +13,20 @@ DEGREE = 3
 
 def basis(u: float) -> F64:
     """The four B_{i,3}(u) of Eq. 7 for 0 <= u <= 1 within a segment, shape (4,); they sum to 1."""
+    out = np.empty(4)
+    fill_basis(u, out)
+    return out
+
+
+@njit(cache=True, nogil=True)
+def fill_basis(u: float, out: F64) -> None:
+    """``basis`` into out (4,)."""
     u2 = u * u
     u3 = u2 * u
-    return (
-        np.array(
-            [(1.0 - 3.0 * u + 3.0 * u2 - u3), (4.0 - 6.0 * u2 + 3.0 * u3), (1.0 + 3.0 * u + 3.0 * u2 - 3.0 * u3), u3]
-        )
-        / 6.0
-    )
+    out[0] = (1.0 - 3.0 * u + 3.0 * u2 - u3) / 6.0
+    out[1] = (4.0 - 6.0 * u2 + 3.0 * u3) / 6.0
+    out[2] = (1.0 + 3.0 * u + 3.0 * u2 - 3.0 * u3) / 6.0
+    out[3] = u3 / 6.0
 
 
 def locate(t_ns: int, knot_ns: int) -> tuple[int, float]:

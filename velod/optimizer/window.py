@@ -10,19 +10,18 @@ window (marginalisation) is a Schur complement that loses nothing.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numba import njit
 
 from velod.config import ImuSettings
 from velod.geometry.so3 import hat
+from velod.optimizer.flow_equation import BIN_NS
+from velod.optimizer.interval import BLOCK, HEAD, Interval
 from velod.optimizer.spline import basis, locate
 from velod.types import F64, I64
 
-BLOCK = 15
-"""States of one segment: control point, b_a, b_w, g_L, common errors of the flows."""
-HEAD = 9
-"""The three control points before the first segment's own."""
 UNKNOWN_VELOCITY = 100.0
 """Prior sigma of the first control points, m/s: no knowledge."""
 NORM_SIGMA = 0.02
@@ -60,6 +59,7 @@ class Window:
         """
         self._common_sigma = common_sigma
         self._imu = imu
+        self._noise_information = BIN_NS * 1e-9 / imu.gyro_noise**2
         self._knot_ns = knot_ns
         self._segments = segments
         self._smoothness = smoothness
@@ -164,25 +164,13 @@ class Window:
         for column, weight in zip(self.control_columns(segment), weights.tolist(), strict=True):
             F[0, column] = F[1, column + 1] = F[2, column + 2] = weight
 
-    def between(self, t_i: int, t_j: int, blocks: F64) -> F64:
-        """J (r, n) with J x = blocks [spline(t_i), b_a, b_w, g_L, spline(t_j)], the middle of t_i's segment."""
-        J = np.zeros((len(blocks), self.size))
-        (at_i, u_i), (at_j, u_j) = locate(t_i, self._knot_ns), locate(t_j, self._knot_ns)
-        columns = np.array([*self.control_columns(at_i), *self.control_columns(at_j)])
-        own = HEAD + BLOCK * (at_i - self.first) + 3
-        _place(columns, np.concatenate((basis(u_i), basis(u_j))), own, blocks, J)
-        return J
-
     def add(self, J: F64, r: F64, information: F64) -> None:
         """A factor (J x - r)^T information (J x - r)."""
         _add_factor(self._H, self._h, self._end, J, r, information)
 
-    def add_information(self, t_ns: int, L: F64, eta: F64) -> None:
-        """Information (9, 9) of [spline, b_w, common errors] at ``t_ns``."""
-        segment, u = locate(t_ns, self._knot_ns)
-        own = HEAD + BLOCK * (segment - self.first)
-        columns = np.array([*self.control_columns(segment), own + 6, own + 12])
-        _add_information(self._H, self._h, self._end, columns, basis(u), L, eta)
+    def add_interval(self, interval: Interval) -> None:
+        """IMU and flows of a complete interval."""
+        interval.fold(self._noise_information, self._knot_ns, self.first, self._H, self._h, self._end)
 
     def shift(self, offset: F64) -> None:
         """Count the spline from another origin: every control point + offset (3,); the information is the same."""
@@ -193,8 +181,8 @@ class Window:
                 change[column : column + 3] = offset
         self._h[:n] += self._H[:n, :n] @ change
 
-    def solve(self, extra: list[tuple[F64, F64, F64]], g_prior: F64 | None, g_sigma: float) -> Solution:
-        """The optimum with further factors (J, r, information) that are not kept.
+    def solve(self, extra: Sequence[Interval], g_prior: F64 | None, g_sigma: float) -> Solution:
+        """The optimum with further intervals that are not kept.
 
         ``g_prior``: last estimate of g_L, ``g_sigma`` the sigma of its direction (rad). The norm of gravity is a
         factor along it on the newest segment, weakened by what a wrong direction would do to the linearisation.
@@ -204,8 +192,8 @@ class Window:
         U, last, x = self._U, self._last, self._h[:n].copy()
         U[:n, :n] = self._H[:n, :n]
         last[:n] = self._end[:n]
-        for J, r, information in extra:
-            _add_factor(U, x, last, J, r, information)
+        for interval in extra:
+            interval.fold(self._noise_information, self._knot_ns, self.first, U, x, last)
         if g_prior is not None:
             direction = g_prior / np.linalg.norm(g_prior)
             sigma = NORM_SIGMA + self._imu.gravity * g_sigma**2
@@ -255,18 +243,6 @@ class Window:
 
 
 @njit(cache=True, nogil=True)
-def _place(columns: I64, weights: F64, own: int, blocks: F64, J: F64) -> None:
-    """Spread the blocks of two splines (r, 15) over their control points; the rest begins at column ``own``."""
-    for p in range(len(J)):
-        for j in range(9):
-            J[p, own + j] = blocks[p, 3 + j]
-        for a in range(8):
-            block = 0 if a < 4 else 12
-            for j in range(3):
-                J[p, columns[a] + j] += weights[a] * blocks[p, block + j]
-
-
-@njit(cache=True, nogil=True)
 def _add_factor(H: F64, h: F64, end: I64, J: F64, r: F64, information: F64) -> None:
     """H += J^T information J and h += J^T information r, over the columns of J (m, n) that are not zero."""
     m, n = J.shape
@@ -294,21 +270,6 @@ def _add_factor(H: F64, h: F64, end: I64, J: F64, r: F64, information: F64) -> N
             H[i, j] += s
             if i != j:
                 H[j, i] += s
-
-
-@njit(cache=True, nogil=True)
-def _add_information(H: F64, h: F64, end: I64, columns: I64, weights: F64, L: F64, eta: F64) -> None:
-    """L (9, 9), eta (9,) of [sum of weights * control points, b_w, common]; ``columns`` (6,): points, b_w, common."""
-    for a in range(6):
-        wa, la = (weights[a], 0) if a < 4 else (1.0, 3 * (a - 3))
-        for i in range(3):
-            row = columns[a] + i
-            end[row] = max(end[row], columns[5] + 3)
-            h[row] += wa * eta[la + i]
-            for b in range(6):
-                w, lb = (wa * weights[b], 0) if b < 4 else (wa, 3 * (b - 3))
-                for j in range(3):
-                    H[row, columns[b] + j] += w * L[la + i, lb + j]
 
 
 @njit(cache=True, nogil=True)

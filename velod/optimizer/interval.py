@@ -1,0 +1,188 @@
+"""One preintegration interval: what the IMU says of it, and the flows within, which share the gyroscope's noise.
+
+The noise of a moment is in both: it turns the velocity that the IMU carries on, and it moves all flows of that moment
+together. Taken as independent, both would err to the same side, too sure of it: sideways at 19 m/s by twice their
+sigma. So it is a nuisance of each bin of BIN_NS, marginalised out of IMU and flows at once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numba import njit
+
+from velod.optimizer.flow_equation import BIN_NS, Bins
+from velod.optimizer.spline import fill_basis
+from velod.types import F64, I64
+
+BLOCK = 15
+"""States of one segment: control point, b_a, b_w, g_L, common errors of the flows."""
+HEAD = 9
+"""The three control points before the first segment's own."""
+
+_POINTS, _OWN = 5, 12
+_LOCAL = 3 * _POINTS + 2 * _OWN
+"""States that an interval can meet: five control points, and what else two segments have."""
+
+
+@dataclass(slots=True)
+class Interval:
+    """From ``t_i`` to ``t_j``; what the IMU says of it up to ``until``, at first nothing.
+
+    That is a residual blocks x + noise n - r with ``information``, x = [spline(t_i), b_a, b_w, g_L, spline(until)].
+    n are the gyroscope's noises of the bins, which flows add their information to.
+    """
+
+    t_i: int
+    t_j: int
+    until: int = field(init=False)
+    blocks: F64 = field(default_factory=lambda: np.zeros((3, 15)))
+    r: F64 = field(default_factory=lambda: np.zeros(3))
+    information: F64 = field(default_factory=lambda: np.zeros((3, 3)))
+    noise: F64 = field(init=False)  # (3, 3 bins)
+    flows: Bins = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.until = self.t_i
+        first = self.t_i // BIN_NS
+        self.flows = Bins(first, -(-self.t_j // BIN_NS) - first)
+        self.noise = np.zeros((3, 3 * self.flows.count))
+
+    def bin_edges(self) -> I64:
+        """Edges (bins + 1,) of the bins, cut to what the IMU says."""
+        edges = (self.flows.first + np.arange(self.flows.count + 1)) * BIN_NS
+        return np.clip(edges, self.t_i, self.until)
+
+    def shift(self, offset: F64) -> None:
+        """Count the spline from another origin: its values + offset (3,)."""
+        self.r += (self.blocks[:, :3] + self.blocks[:, 12:]) @ offset
+        self.flows.eta += self.flows.L[:, :, :3] @ offset
+
+    def fold(self, noise_information: float, knot_ns: int, first: int, H: F64, h: F64, end: I64) -> None:
+        """Add what IMU and flows say to the normal equations of a window whose first segment is ``first``.
+
+        ``noise_information``: of the gyroscope's noise in one bin, (rad/s)^-2.
+        """
+        _fold(
+            self.t_i, self.until, self.blocks, self.r, self.information, self.noise,
+            self.flows.first, self.flows.total, self.flows.L, self.flows.eta,
+            noise_information, knot_ns, first, H, h, end,
+        )  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
+def _fold(
+    t_i: int,
+    until: int,
+    blocks: F64,
+    r: F64,
+    information: F64,
+    noise: F64,
+    first_bin: int,
+    total: F64,
+    L: F64,
+    eta: F64,
+    noise_information: float,
+    knot_ns: int,
+    first: int,
+    H: F64,
+    h: F64,
+    end: I64,
+) -> None:
+    size = _LOCAL + noise.shape[1]
+    A, g = np.zeros((size, size)), np.zeros(size)
+    segment = t_i // knot_ns
+    _add_imu(t_i, until, segment, knot_ns, blocks, r, information, noise, A, g)
+    for k in range(len(total)):
+        n = _LOCAL + 3 * k
+        for i in range(3):
+            A[n + i, n + i] += noise_information
+        if total[k, 0] > 0.0:
+            t = (first_bin + k) * BIN_NS + int(total[k, 1] / total[k, 0])
+            _add_flows(t, segment, knot_ns, n, L[k], eta[k], A, g)
+    _eliminate_tail(A, g, _LOCAL)
+    _spread(A, g, segment - first, H, h, end)
+
+
+@njit(cache=True, nogil=True)
+def _add_imu(t_i, until, segment, knot_ns, blocks, r, information, noise, A, g):  # type: ignore[no-untyped-def]
+    J, w, row = np.zeros((3, len(g))), np.empty(4), np.empty(3)
+    for at, t in ((0, t_i), (12, until)):
+        k = t // knot_ns
+        fill_basis((t - k * knot_ns) / knot_ns, w)
+        for a in range(4):
+            for i in range(3):
+                for j in range(3):
+                    J[i, 3 * (k - segment + a) + j] += w[a] * blocks[i, at + j]
+    J[:, 3 * _POINTS : 3 * _POINTS + 9] = blocks[:, 3:12]
+    J[:, _LOCAL:] = noise
+    for a in range(len(g)):
+        for q in range(3):
+            row[q] = J[0, a] * information[0, q] + J[1, a] * information[1, q] + J[2, a] * information[2, q]
+        g[a] += row[0] * r[0] + row[1] * r[1] + row[2] * r[2]
+        for b in range(a, len(g)):
+            A[a, b] += row[0] * J[0, b] + row[1] * J[1, b] + row[2] * J[2, b]
+
+
+@njit(cache=True, nogil=True)
+def _add_flows(t, segment, knot_ns, n, L, eta, A, g):  # type: ignore[no-untyped-def]
+    """L (9, 9) and eta (9,) of [spline(t), b_w, common], in which the noise ``n`` enters as b_w does."""
+    k = t // knot_ns
+    own = 3 * _POINTS + _OWN * (k - segment)
+    w, column, part = np.ones(7), np.empty(7, np.int64), np.empty(7, np.int64)
+    fill_basis((t - k * knot_ns) / knot_ns, w[:4])
+    for a in range(4):
+        column[a], part[a] = 3 * (k - segment + a), 0
+    column[4], part[4] = own + 3, 3
+    column[5], part[5] = own + 9, 6
+    column[6], part[6] = n, 3
+    for a in range(7):
+        for i in range(3):
+            g[column[a] + i] += w[a] * eta[part[a] + i]
+            for b in range(a, 7):
+                for j in range(3):
+                    if column[b] + j >= column[a] + i:
+                        A[column[a] + i, column[b] + j] += w[a] * w[b] * L[part[a] + i, part[b] + j]
+
+
+@njit(cache=True, nogil=True)
+def _eliminate_tail(A, g, kept):  # type: ignore[no-untyped-def]
+    """Schur complement of the states from ``kept`` on; A is its upper triangle."""
+    for p in range(len(g) - 1, kept - 1, -1):
+        for i in range(p):
+            if A[i, p] == 0.0:
+                continue
+            f = A[i, p] / A[p, p]
+            g[i] -= f * g[p]
+            for j in range(i, p):
+                A[i, j] -= f * A[j, p]
+
+
+@njit(cache=True, nogil=True)
+def _spread(A, g, k, H, h, end):  # type: ignore[no-untyped-def]
+    """Add the local states to those of the window; the interval begins in its ``k``-th segment."""
+    columns = np.empty(_LOCAL, np.int64)
+    for a in range(_POINTS):
+        start = HEAD + BLOCK * (k + a - 3) if k + a >= 3 else 3 * (k + a)
+        for i in range(3):
+            columns[3 * a + i] = start + i
+    for b in range(2):
+        for i in range(_OWN):
+            columns[3 * _POINTS + _OWN * b + i] = HEAD + BLOCK * (k + b) + 3 + i
+    reach = 0
+    for a in range(_LOCAL):
+        if A[a, a] != 0.0:
+            reach = max(reach, columns[a] + 1)
+    for a in range(_LOCAL):
+        if A[a, a] == 0.0:
+            continue
+        i = columns[a]
+        h[i] += g[a]
+        end[i] = max(end[i], reach)
+        for b in range(a, _LOCAL):
+            if A[a, b] != 0.0:
+                j = columns[b]
+                H[i, j] += A[a, b]
+                if i != j:
+                    H[j, i] += A[a, b]
