@@ -8,20 +8,24 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import cv2
+import numpy as np
 
 from velod.cli_exit import RunFailed
 from velod.cli_report import write_json
-from velod.config import Settings
+from velod.config import Settings, from_tree
 from velod.eval.bench import Result, Size, measure
 from velod.eval.bench_cases import GROUPS, Packets, cases
 from velod.eval.bench_input import RIG, record
 from velod.runtime.offline import run_offline
-from velod.runtime.online import OnlineError, run_online
+from velod.runtime.online import OnlineError, OnlineResult, run_online
 from velod.runtime.player import player_command
 from velod.runtime.warmup import fill_cache
-from velod.types import NS_PER_S, Velocity
+from velod.types import NS_PER_S, EventPacket, FlowBatch, Velocity
+from velod.wire import Envelope
+from velod.wire.topics import EVENTS, FLOW
 
 
 def bench(group: str, json: str | None, size: Size | None = None) -> int:
@@ -38,8 +42,9 @@ def bench(group: str, json: str | None, size: Size | None = None) -> int:
             results.append(measure(case, size))
             print(_line(results[-1]), file=table, flush=True)
         if name == "pipeline":
-            results.append(dataflow(size.dataflow_seconds))
-            print(_line(results[-1]), file=table, flush=True)
+            for whole in (dataflow, event_latency):
+                results.append(whole(size.dataflow_seconds))
+                print(_line(results[-1]), file=table, flush=True)
     if json is not None:
         write_json(json, [r.row() for r in results])
     return 0
@@ -59,25 +64,69 @@ def dataflow(seconds: float) -> Result:
     settings = Settings()
     settings = replace(
         settings,
-        rig=replace(settings.rig, name="bench"),
         optimizer=replace(settings.optimizer, max_wait_ms=math.inf),
-        zenoh=replace(settings.zenoh, lossless=True, port=_free_port()),
+        zenoh=replace(settings.zenoh, lossless=True),
     )
-    trouble: list[str] = []
-    with TemporaryDirectory() as directory:
-        path = Path(directory) / "stream.h5"
-        events = record(path, seconds, seed=1)
-        driver = player_command(str(path), settings.zenoh, settings.rig.name, None)
-        try:
-            out = run_online(settings, RIG, driver, on_line=trouble.append).velocities
-        except OnlineError as e:
-            raise RunFailed(str(e)) from None
-    if len(out) < 2 or out[-1].t_pub_ns == out[0].t_pub_ns:
-        raise RunFailed("the processes put out nothing: " + "; ".join(trouble[-3:]))
+    result, events = _through_the_processes(settings, seconds, speed=None)
+    out = result.velocities
     host_us = (out[-1].t_pub_ns - out[0].t_pub_ns) / 1e3
     sensor_s = (out[-1].velocity.t_ns - out[0].velocity.t_ns) / NS_PER_S
     batches = out[-1].velocity.batch_seq - max(0, out[0].velocity.batch_seq)
     return Result("pipeline.sustained", host_us / batches, None, None, batches, events / seconds * sensor_s / host_us)
+
+
+def event_latency(seconds: float) -> Result:
+    """``pipeline.event_to_flow``: event by event, in real time, from a driver's packet to the flow that it completes.
+
+    Between the moments of publication, with packets and slices of a millisecond; an event may have waited for as long
+    in the packet. Raises RunFailed, SessionError.
+    """
+    settings = from_tree({"ingest": {"mode": "event"}})
+    packets: dict[int, int] = {}  # end of the packet -> published at
+    flows: dict[int, int] = {}  # end of the slice -> published at
+
+    def note(envelope: Envelope) -> None:
+        message = envelope.message
+        if isinstance(message, EventPacket) and message.camera == "left":
+            packets[message.t_ns] = envelope.t_pub_ns
+        elif isinstance(message, FlowBatch):
+            flows[message.t_ns] = envelope.t_pub_ns
+
+    _through_the_processes(settings, seconds, speed=1.0, packets="1000hz", on_envelope=note, topics=(EVENTS, FLOW))
+    ends = np.array(sorted(packets))
+    waited_ns = [
+        published_ns - packets[int(ends[k])]
+        for t_ns, published_ns in flows.items()
+        if (k := int(np.searchsorted(ends, t_ns))) < len(ends)
+    ]
+    if not waited_ns:
+        raise RunFailed("the processes put out no flow")
+    return Result("pipeline.event_to_flow", float(np.median(waited_ns)) / 1e3, None, None, len(waited_ns))
+
+
+def _through_the_processes(
+    settings: Settings, seconds: float, speed: float | None, packets: str = "200hz", **listening: Any
+) -> tuple[OnlineResult, int]:
+    """Play the benchmark's stream through all processes; what came out, and how many events went in.
+
+    Raises RunFailed, SessionError.
+    """
+    zenoh, rig = replace(settings.zenoh, port=_free_port()), replace(settings.rig, name="bench")
+    trouble: list[str] = []
+    with TemporaryDirectory() as directory:
+        path = Path(directory) / "stream.h5"
+        events = record(path, seconds, seed=1)
+        driver = player_command(str(path), zenoh, rig.name, speed, packets)
+        try:
+            result = run_online(
+                replace(settings, zenoh=zenoh, rig=rig), RIG, driver, on_line=trouble.append, **listening
+            )
+        except OnlineError as e:
+            raise RunFailed(str(e)) from None
+    out = result.velocities
+    if len(out) < 2 or out[-1].t_pub_ns == out[0].t_pub_ns:
+        raise RunFailed("the processes put out nothing: " + "; ".join(trouble[-3:]))
+    return result, events
 
 
 def _free_port() -> int:

@@ -57,6 +57,7 @@ def cases(group: str, size: Size, run_pipeline: RunPipeline) -> Iterator[Case]:
         yield sae(size)
         event_batch, _ = selected(size)
         yield plane_fit(event_batch)
+        yield event_by_event(size)
         yield worker("flow.worker", FlowStage(Settings(), RIG), event_batch)
     elif group == "depth":
         _, stereo_batch = selected(size)
@@ -128,6 +129,33 @@ def plane_fit(batch: EventBatch) -> Case:
         return float(np.median(np.abs(run_peer()[flow.index] / flow.speed - 1.0)))
 
     return Case("flow.plane_fit", run, n, "numpy lstsq per patch", run_peer, n, disagreement, slow=True)
+
+
+def event_by_event(size: Size) -> Case:
+    """``flow.event_by_event``: a flow in event-by-event mode where every event that can gives one, all in.
+
+    From left events on: checks, surfaces, selection, slices, and the flow worker's fits, for ``size.events`` at a
+    time, divided by the flows that come of them.
+    """
+    settings = from_tree({"ingest": {"mode": "event", "rest_ms": 0.0, "batch": "count", "count": size.events}})
+    ingest, flow, stream = IngestStage(settings, RIG), FlowStage(settings, RIG), _batch_packets(size)
+
+    def run() -> int:
+        left, right = next(stream)
+        # Flow needs one camera: the other is only as far.
+        messages = ingest.handle(EventPacket(right.seq, right.t_ns, "right", *(c[:0] for c in columns(right))))
+        start_ns = time.perf_counter_ns()
+        messages += ingest.handle(left)
+        flows = sum(len(flow.handle(m)[0].index) for m in messages if isinstance(m, EventBatch))
+        # There are none where the stream begins anew.
+        return (time.perf_counter_ns() - start_ns) // max(flows, 1)
+
+    return Case("flow.event_by_event", run, clocked=True)
+
+
+def columns(packet: EventPacket) -> tuple[np.ndarray, ...]:
+    """x, y, event_t_ns and p."""
+    return packet.x, packet.y, packet.event_t_ns, packet.p
 
 
 # --- depth ---

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 from numba import njit
 
 from velod.types import F64, PATCH
@@ -21,7 +22,34 @@ PlaneFit = tuple[int, float, float, float, float, float, float, float]
 """(n, gx, gy, t0, rms, qxx, qxy, qyy): see ``fit_plane``."""
 
 
-@njit(cache=True, nogil=True)
+DX, DY = (offset.ravel().astype(np.float64) for offset in np.mgrid[-HALF : HALF + 1, -HALF : HALF + 1][::-1])
+"""Of the neighbours from the centre, px, row-major."""
+BIT = 1 << np.arange(SIZE)
+ALL = int(BIT.sum())
+"""Sets of neighbours are the bits of a number."""
+
+ANY_ORDER = {"reassoc", "contract", "nsz"}
+"""Floating-point freedom of the kernels here: in the order that is written no sum could be vectorised."""
+
+
+@njit(fastmath=ANY_ORDER, cache=True, nogil=True, error_model="numpy")
+def _moments(kept: np.int64) -> tuple[float, float, float, float, float, float]:
+    """Sums of 1, dx, dy, dx^2, dx dy and dy^2 over the neighbours ``kept``."""
+    if kept == ALL:
+        return 25.0, 0.0, 0.0, 50.0, 0.0, 50.0
+    n = x = y = xx = xy = yy = 0.0
+    for i in range(SIZE):
+        k = 1.0 if kept & BIT[i] else 0.0
+        n += k
+        x += k * DX[i]
+        y += k * DY[i]
+        xx += k * DX[i] * DX[i]
+        xy += k * DX[i] * DY[i]
+        yy += k * DY[i] * DY[i]
+    return n, x, y, xx, xy, yy
+
+
+@njit(fastmath=ANY_ORDER, cache=True, nogil=True, error_model="numpy")
 def fit_plane(age: F64, reject_px: float, rejections: int, min_neighbours: int) -> PlaneFit:
     """Least-squares plane t = gx dx + gy dy + t0 through the neighbours, outliers rejected.
 
@@ -34,51 +62,42 @@ def fit_plane(age: F64, reject_px: float, rejections: int, min_neighbours: int) 
     its covariance is sigma_t^2 Q. n = 0 (and zeros) where fewer than ``min_neighbours`` are left or the fit is
     near-singular.
     """
-    kept = 0
+    missing = np.int64(0)
     for i in range(SIZE):
-        kept |= int(age[i] > 0.0) << i
+        missing |= np.int64(0) if age[i] > 0.0 else BIT[i]
+    kept = ALL & ~missing
+    # Times are taken from the centre's, so that no digits are lost when centring the moments.
     t_ref = -age[SIZE // 2]
     for round_ in range(rejections + 1):
-        # One branchless pass; t is taken from the centre's, so that no digits are lost when centring the moments.
-        i = n = x = y = xx = xy = yy = 0
+        n, x, y, xx, xy, yy = _moments(kept)
         t = xt = yt = 0.0
-        for dy in range(-HALF, HALF + 1):
-            for dx in range(-HALF, HALF + 1):
-                k = kept >> i & 1
-                n += k
-                x += k * dx
-                y += k * dy
-                xx += k * dx * dx
-                xy += k * dx * dy
-                yy += k * dy * dy
-                kt = k * (-age[i] - t_ref)
-                t += kt
-                xt += dx * kt
-                yt += dy * kt
-                i += 1
+        for i in range(SIZE):
+            kt = -age[i] - t_ref if kept & BIT[i] else 0.0
+            t += kt
+            xt += DX[i] * kt
+            yt += DY[i] * kt
         if n < min_neighbours or n < 3:
             break
-        mx, my, mt = x / n, y / n, t / n
+        per_n = 1.0 / n
+        mx, my, mt = x * per_n, y * per_n, t * per_n
         sxx, sxy, syy = xx - x * mx, xy - x * my, yy - y * my
         sxt, syt = xt - x * mt, yt - y * mt
         det = sxx * syy - sxy * sxy
         if det <= MIN_DETERMINANT * sxx * syy:
             break
-        gx = (syy * sxt - sxy * syt) / det
-        gy = (sxx * syt - sxy * sxt) / det
+        qxx, qxy, qyy = syy / det, -sxy / det, sxx / det
+        gx = qxx * sxt + qxy * syt
+        gy = qxy * sxt + qyy * syt
         t0 = mt - gx * mx - gy * my + t_ref
         limit = reject_px * math.sqrt(gx * gx + gy * gy)
         rss = 0.0
-        i = outliers = 0
-        for dy in range(-HALF, HALF + 1):
-            for dx in range(-HALF, HALF + 1):
-                k = kept >> i & 1
-                r = -age[i] - t0 - gx * dx - gy * dy
-                rss += k * r * r
-                outliers |= int(abs(r) > limit) << i
-                i += 1
+        outliers = np.int64(0)
+        for i in range(SIZE):
+            r = -age[i] - t0 - gx * DX[i] - gy * DY[i]
+            rss += r * r if kept & BIT[i] else 0.0
+            outliers |= BIT[i] if abs(r) > limit else np.int64(0)
         outliers &= kept
         if outliers == 0 or round_ == rejections:
-            return n, gx, gy, t0, math.sqrt(rss / n), syy / det, -sxy / det, sxx / det
+            return int(n), gx, gy, t0, math.sqrt(rss * per_n), qxx, qxy, qyy
         kept &= ~outliers
     return 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0

@@ -18,7 +18,7 @@ from velod.runtime.measure import GapCounter
 from velod.runtime.process import ChildProcess, LineSink, stop_all, to_stderr
 from velod.runtime.supervisor import Supervisor
 from velod.types import Health, Message, Velocity
-from velod.wire import WireError, decode
+from velod.wire import Envelope, WireError, decode
 from velod.wire.topics import HEALTH, VELOCITY, Topic, key
 
 START_S = 180.0
@@ -96,6 +96,7 @@ def run_online(
     on_velocity: Callable[[Published], None] | None = None,
     *,
     on_message: Callable[[Message], None] | None = None,
+    on_envelope: Callable[[Envelope], None] | None = None,
     topics: Iterable[Topic] = (),
     on_step: Callable[[Supervisor], None] | None = None,
     on_line: LineSink = to_stderr,
@@ -104,12 +105,13 @@ def run_online(
 ) -> OnlineResult:
     """Start the service, run the driver to its end, stop everything.
 
-    ``on_velocity`` is called with each velocity, ``on_message`` with each message of further ``topics``, ``on_step``
-    every 20 ms or so, all in this thread. Setting ``stop`` ends the run early. Raises OnlineError, SessionError.
+    ``on_velocity`` is called with each velocity, ``on_message`` with each message of further ``topics``,
+    ``on_envelope`` with the same and their host times, ``on_step`` every 20 ms or so, all in this thread. Setting
+    ``stop`` ends the run early. Raises OnlineError, SessionError.
     """
     result = OnlineResult()
     with Supervisor(settings, calibration, spare=spare, on_line=on_line) as supervisor:
-        collector = _Collector(result, settings.rig.name, on_velocity, on_message)
+        collector = _Collector(result, settings.rig.name, on_velocity, on_message, on_envelope)
         collector.subscribe(supervisor.session, (VELOCITY, HEALTH, *topics))
         _wait_until_up(supervisor, collector, stop)
         started_s = time.monotonic()
@@ -154,9 +156,10 @@ class _Collector:
         rig: str,
         on_velocity: Callable[[Published], None] | None,
         on_message: Callable[[Message], None] | None,
+        on_envelope: Callable[[Envelope], None] | None,
     ) -> None:
         self._result, self._rig = result, rig
-        self._on_velocity, self._on_message = on_velocity, on_message
+        self._on_velocity, self._on_message, self._on_envelope = on_velocity, on_message, on_envelope
         self._inbox = Inbox()
         self._gaps = GapCounter()
 
@@ -195,5 +198,8 @@ class _Collector:
                 self._on_velocity(published)
         elif isinstance(message, Health):
             self._result.health[message.worker] = message
-        elif self._on_message is not None:
-            self._on_message(message)
+        else:
+            if self._on_message is not None:
+                self._on_message(message)
+            if self._on_envelope is not None:
+                self._on_envelope(envelope)
