@@ -187,6 +187,15 @@ class OptimizerSettings:
     zero_velocity: bool = _f(True, "rest is observed as zero velocity: no moving events and a quiet IMU")
     ransac_iterations: int = _f(64, "minimal samples of the linear solver (Eq. 15)", lo=8, hi=10_000)
     min_flows: int = _f(12, "flows with a depth that a batch must have", lo=6, hi=10_000)
+    alarm_clock_ms: float = _f(
+        1.0, "alarm where the cameras' clocks are seen to differ by more, ms; 0: never", lo=0.0, hi=100.0
+    )
+    alarm_rows_px: float = _f(
+        0.4, "alarm where the rectified rows are seen to differ by more, px; 0: never", lo=0.0, hi=10.0
+    )
+    alarm_scale_percent: float = _f(
+        0.5, "alarm where the scale is seen to differ from the IMU's by more, %; 0: never", lo=0.0, hi=50.0
+    )
     seed: int = _f(1, "of all random choices", lo=0, hi=2**31 - 1)
 
 

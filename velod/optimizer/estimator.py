@@ -97,6 +97,7 @@ class Estimator:
         self.head: Head | None = None
         self.batches = 0  # that gave a velocity
         self.last_usable_t_ns = 0
+        self.own_solution: tuple[int, F64, F64] | None = None  # end of the newest batch with one, s_L there, its e
         self._open: list[Interval] = []  # that may get flows yet; the last one is incomplete
         # t_ns -> the IMU up to there and the prediction, from the head ``_carried_from``
         self._carried: dict[int, tuple[Preintegration, F64, F64]] = {}
@@ -299,6 +300,7 @@ class Estimator:
         if fit is None:
             self._count("fit.undetermined")
             return
+        self.own_solution = (t_ns, self.memory.at(np.array([t_ns]))[1][0], fit.e)
         shared = self._o.shared_error
         if predicted is not None:
             shared *= max(1.0, self._innovation(t_ns, fit, predicted) / INNOVATION_GATE)

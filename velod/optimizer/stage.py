@@ -14,6 +14,7 @@ import numpy as np
 from velod.config import Settings
 from velod.geometry.calibration import Calibration
 from velod.optimizer.attitude import Attitude
+from velod.optimizer.calibration_check import CalibrationCheck
 from velod.optimizer.dead_reckoning import DeadReckoning
 from velod.optimizer.estimator import Estimator
 from velod.optimizer.parts import Parts, batch_seq
@@ -44,7 +45,8 @@ class OptimizerStage:
         wait = settings.optimizer.max_wait_ms
         self._max_wait_ns = int(wait * 1e6) if np.isfinite(wait) else None
         self.counters: dict[str, int] = {}
-        self.alarms: dict[str, str] = {}
+        self._check = CalibrationCheck(settings.optimizer)
+        self.alarms, self.gauges = self._check.alarms, self._check.gauges
         self._seq = 0
         self._reckoning = DeadReckoning(settings.optimizer.window_s, settings.imu.gyro_noise)
         self._pending: dict[int, Parts] = {}  # by the number of the batch
@@ -220,8 +222,14 @@ class OptimizerStage:
                 self._count("batch.too_late")
                 return
         self._estimator.absorb(flow, depth)
+        self._check_calibration(flow, depth)
         if flow.t_ns > self._newest[1]:
             self._newest = (seq, flow.t_ns)
+
+    def _check_calibration(self, flow: FlowBatch, depth: DepthBatch) -> None:
+        self._check.add_batch(flow, depth)
+        if (own := self._estimator.own_solution) is not None and own[0] == flow.t_ns:
+            self._check.add_solution(*own)
 
     def _put_out(self, tau: int) -> list[Velocity | Odometry]:
         """The velocity at ``tau``; with its dead reckoning where it is valid."""

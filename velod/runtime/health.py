@@ -40,7 +40,14 @@ class HealthReporter:
         """Time until the next report, 0 when it is due."""
         return max(0.0, self._last_s + PERIOD_S - time.monotonic())
 
-    def report(self, t_ns: int, counters: dict[str, int], alarms: dict[str, str], role: str = "") -> Health:
+    def report(
+        self,
+        t_ns: int,
+        counters: dict[str, int],
+        alarms: dict[str, str],
+        role: str = "",
+        gauges: dict[str, float] | None = None,
+    ) -> Health:
         """Health of the period that ends now. ``t_ns``: newest sensor time seen, 0 for none."""
         now_s = time.monotonic()
         elapsed_s = max(now_s - self._last_s, 1e-3)
@@ -63,6 +70,7 @@ class HealthReporter:
             latency_ms=self._latency_ms(),
             alarms=alarms,
             role=role,
+            gauges=gauges or {},
         )
         self._seq += 1
         self._last_s, self._before = now_s, dict(counters)

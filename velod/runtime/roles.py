@@ -113,6 +113,10 @@ class IngestShell(WorkerShell):
         """With those of dispatch and of the load."""
         return {**super().alarms(), **self._dispatch.alarms(), **self._load.alarms()}
 
+    def gauges(self) -> dict[str, float]:
+        """With the shares of the load that were taken on."""
+        return {**super().gauges(), **self._load.shares()}
+
 
 class BatchShell(WorkerShell):
     """A flow or depth worker: one batch in, one result out, and word to the dispatcher that it is done."""

@@ -21,7 +21,7 @@ from velod.runtime.health import HealthReporter
 from velod.runtime.inbox import Inbox, Item
 from velod.runtime.measure import GapCounter
 from velod.runtime.outlet import Outlet
-from velod.runtime.stages import Stage, alarms_of
+from velod.runtime.stages import Stage, alarms_of, gauges_of
 from velod.types import Message
 from velod.wire import Envelope, WireError, decode
 from velod.wire.topics import ALIVE, HEALTH, Topic, key, parts
@@ -122,6 +122,10 @@ class WorkerShell:
         behind = {} if (n := self.inbox.waiting()) < BEHIND else {"inbox.behind": f"{n} messages wait to be handled"}
         return {**alarms_of(self.stage), **silent, **behind}
 
+    def gauges(self) -> dict[str, float]:
+        """Values of now, unit in the name."""
+        return gauges_of(self.stage)
+
     def role(self) -> str:
         """What the process is among those of its stage, where that can change."""
         return ""
@@ -135,7 +139,7 @@ class WorkerShell:
 
     def every_second(self) -> None:
         """Publish the health of the period that ends."""
-        health = self.health.report(self._t_ns, self.counters(), self.alarms(), self.role())
+        health = self.health.report(self._t_ns, self.counters(), self.alarms(), self.role(), self.gauges())
         self.outlet.publish(HEALTH, health, worker=self.worker)
 
     # What all roles use ---------------------------------------------------------------------------------------

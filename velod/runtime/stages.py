@@ -63,6 +63,12 @@ def alarms_of(stage: Stage) -> dict[str, str]:
     return dict(alarms)
 
 
+def gauges_of(stage: Stage) -> dict[str, float]:
+    """What a stage measures that is neither count nor time, by name and unit."""
+    gauges: dict[str, float] = getattr(stage, "gauges", {})
+    return dict(gauges)
+
+
 def worker_names(settings: Settings, stage: str) -> list[str]:
     """The workers of one stage: ``flow-0``, ``flow-1``, ..."""
     count = {

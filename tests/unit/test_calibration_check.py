@@ -1,0 +1,224 @@
+"""What flow, depth and IMU say of the calibration: faults raise an alarm where they can be seen, and only then."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests import synthetic
+from velod.config import OptimizerSettings, Settings
+from velod.depth.stage import DepthStage
+from velod.flow.stage import FlowStage
+from velod.geometry.calibration import Calibration
+from velod.ingest.stage import IngestStage
+from velod.io import open_recording
+from velod.optimizer.calibration_check import CLOCK, EVERY, ROWS, SCALE, CalibrationCheck
+from velod.optimizer.scale_check import SPAN_S, ScaleCheck
+from velod.optimizer.stage import OptimizerStage
+from velod.optimizer.stereo_check import MIN_BATCHES, NEAR_PX, StereoCheck, _neighbours, _robust_sums
+from velod.types import DepthBatch, EventBatch, EventPacket, FlowBatch, StereoBatch
+
+DATA = Path(__file__).parents[3] / "shared" / "data"
+
+
+# --- rows and clocks, on edges in closed form
+
+
+def stereo_edges(
+    seq: int, flow_px_s: np.ndarray, clock_s: float, row_px: float, noise: float = 1.0
+) -> tuple[FlowBatch, DepthBatch]:
+    """Short edges that lean every way, on a slanted wall that moves by ``flow_px_s``.
+
+    Each is matched where, at the left event's time by the right clock, it crosses the row in the right image.
+    """
+    rng = np.random.default_rng(seq)
+    m = 300
+    at = rng.uniform([20.0, 20.0], [320.0, 240.0], (m, 2))
+    angle = rng.uniform(-1.2, 1.2, m)
+    n = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    n *= np.sign(n @ flow_px_s)[:, None]
+    speed = n @ flow_px_s
+    true_px = 15.0 + 0.02 * at[:, 0] + 0.01 * at[:, 1]
+    # The right image shows the edge as it was clock_s ago, row_px lower: it is the line n . (p - p0) = 0.
+    p0 = at - np.stack([true_px, np.zeros(m)], axis=1) - flow_px_s * clock_s + [0.0, row_px]
+    crossing_x = p0[:, 0] - n[:, 1] / n[:, 0] * (at[:, 1] - p0[:, 1])
+    f32 = np.float32
+    disparity = at[:, 0] - crossing_x + noise * rng.normal(0.0, 0.05, m) / np.abs(n[:, 0])
+    measured = speed * (1.0 + noise * rng.normal(0.0, 0.02, m))
+    index = np.arange(m, dtype=np.uint16)
+    x, y = at.astype(f32).T
+    flow = FlowBatch(
+        seq, 10 * seq, m, index, np.ones(m, np.uint32), x, y, n.astype(f32),
+        measured.astype(f32), (0.02 * speed + 0.1).astype(f32),
+    )  # fmt: skip
+    ones = np.ones(m, np.uint8)
+    return flow, DepthBatch(seq, 10 * seq, m, index, disparity.astype(f32), ones.astype(f32), ones.astype(f32), ones)
+
+
+def seen(clock_s: float, row_px: float, flows: list[tuple[float, float]]) -> StereoCheck:
+    check = StereoCheck()
+    for seq in range(2 * MIN_BATCHES):
+        check.add(*stereo_edges(seq, np.array(flows[seq % len(flows)]), clock_s, row_px))
+    return check
+
+
+@pytest.mark.parametrize(("clock_s", "row_px"), [(0.0, 0.0), (0.003, 0.0), (-0.001, 0.3), (0.0, -1.0)])
+def test_clock_and_rows_are_told_apart_by_motion_that_varies(clock_s: float, row_px: float) -> None:
+    offsets = seen(clock_s, row_px, [(300.0, 200.0), (-250.0, 120.0), (200.0, -260.0)]).offsets()
+    assert offsets is not None
+    assert abs(offsets.clock_s - clock_s) < max(4 * offsets.clock_sigma_s, 0.05 * abs(clock_s) + 2e-5)
+    assert abs(offsets.row_px - row_px) < max(4 * offsets.row_sigma_px, 0.05 * abs(row_px) + 0.01)
+    assert offsets.clock_sigma_s < 2e-4
+    assert offsets.row_sigma_px < 0.05
+
+
+def test_a_slide_along_the_rows_says_nothing_of_the_clocks_but_all_of_the_rows() -> None:
+    offsets = seen(0.003, 0.5, [(300.0, 0.0)]).offsets()
+    assert offsets is not None
+    assert offsets.clock_sigma_s == math.inf
+    assert offsets.row_px == pytest.approx(0.5, abs=0.05)
+
+
+def test_few_batches_say_nothing() -> None:
+    check = StereoCheck()
+    for seq in range(MIN_BATCHES - 1):
+        check.add(*stereo_edges(seq, np.array([300.0, 200.0]), 0.003, 0.0))
+    assert check.offsets() is None
+
+
+def test_the_kernels_are_their_plain_twins() -> None:
+    flow, depth = stereo_edges(1, np.array([200.0, 150.0]), 0.002, 0.4)
+    x, y, n = flow.x.astype(float), flow.y.astype(float), flow.n.astype(float)
+    u, d = flow.speed / n[:, 0], depth.disparity.astype(float)
+    sigma_u = 0.02 * np.abs(u)
+    rows = np.empty((4096, 5))
+    rows = rows[: _neighbours(x, y, n, d, u, sigma_u, rows)]
+    i, j = np.tril_indices(len(x), -1)
+    near = (np.abs(x[i] - x[j]) < NEAR_PX) & (np.abs(y[i] - y[j]) < NEAR_PX)
+    i, j, lean = i[near], j[near], n[:, 1] / n[:, 0]
+    shape = np.hypot(1.0 / n[i, 0], 1.0 / n[j, 0])
+    twin = np.stack([d[i] - d[j], u[i] - u[j], lean[j] - lean[i], shape, sigma_u[i] ** 2 + sigma_u[j] ** 2], axis=1)
+    np.testing.assert_allclose(rows, twin, rtol=1e-12, atol=1e-12)
+
+    H, h, solution = np.zeros((2, 2)), np.zeros(2), np.zeros(2)
+    noise = _robust_sums(rows, H, h)
+    for _ in range(5):
+        size = np.abs(twin[:, 0] - twin[:, 1:3] @ solution) / shape
+        scale = 2.0 * np.median(size)
+        w = 1.0 / (1.0 + (size / scale) ** 2) / (shape * scale) ** 2
+        H_twin, h_twin = (twin[:, 1:3] * w[:, None]).T @ twin[:, 1:3], twin[:, 1:3].T @ (w * twin[:, 0])
+        solution = np.linalg.solve(H_twin, h_twin)
+    np.testing.assert_allclose(H, H_twin, rtol=1e-9)
+    np.testing.assert_allclose(h, h_twin, rtol=1e-9, atol=1e-9)
+    assert noise == pytest.approx(float(w @ twin[:, 4]))
+
+
+# --- on recordings that velod did not make
+
+
+def front_end(path: Path, late_ns: int = 0, calibration: Calibration | None = None) -> CalibrationCheck:
+    """The check over a whole recording, whose right camera is ``late_ns`` late."""
+    recording = open_recording(path, calibration=calibration)
+    ingest, flow, depth = (s(Settings(), recording.calibration) for s in (IngestStage, FlowStage, DepthStage))
+    check = CalibrationCheck(OptimizerSettings())
+    flows: list[FlowBatch] = []
+    depths: list[DepthBatch] = []
+    for packet in recording.packets():
+        if late_ns and isinstance(packet, EventPacket) and packet.camera == "right":
+            packet = replace(packet, t_ns=packet.t_ns + late_ns, event_t_ns=packet.event_t_ns + late_ns)
+        for message in ingest.handle(packet):
+            if isinstance(message, EventBatch) and message.seq % EVERY == 0:
+                flows += flow.handle(message)
+            elif isinstance(message, StereoBatch) and message.seq % EVERY == 0:
+                depths += depth.handle(message)
+    for pair in zip(flows, depths, strict=True):
+        for _ in range(EVERY):
+            check.add_batch(*pair)
+    return check
+
+
+@pytest.mark.data
+@pytest.mark.skipif(not DATA.is_dir(), reason="no recordings in ../shared/data")
+@pytest.mark.parametrize("name", ["boxes_esim.h5", "boxes_v2e.h5", "slider_pseudo_stereo.h5"])
+def test_recordings_with_a_right_calibration_raise_no_alarm(name: str) -> None:
+    check = front_end(DATA / name)
+    assert check.alarms == {}
+    assert abs(check.gauges["calibration.rows_px"]) < 0.3
+    if "slider" in name:
+        assert "calibration.clock_ms" not in check.gauges, "a slide along the rows does not show it"
+    else:
+        assert abs(check.gauges["calibration.clock_ms"]) < 0.3
+
+
+@pytest.mark.data
+@pytest.mark.skipif(not DATA.is_dir(), reason="no recordings in ../shared/data")
+@pytest.mark.parametrize("name", ["boxes_esim.h5", "boxes_v2e.h5"])
+def test_a_right_camera_that_is_3_ms_late_raises_an_alarm(name: str) -> None:
+    check = front_end(DATA / name, late_ns=3_000_000)
+    assert "late" in check.alarms[CLOCK]
+    assert 2.0 < check.gauges["calibration.clock_ms"] < 4.0
+
+
+@pytest.mark.data
+@pytest.mark.skipif(not DATA.is_dir(), reason="no recordings in ../shared/data")
+def test_a_principal_point_that_is_a_pixel_off_raises_an_alarm() -> None:
+    calibration = open_recording(DATA / "boxes_esim.h5").calibration
+    wrong = replace(calibration, right=replace(calibration.right, cy=calibration.right.cy - 1.0))
+    check = front_end(DATA / "boxes_esim.h5", calibration=wrong)
+    assert "low" in check.alarms[ROWS]
+    assert check.gauges["calibration.rows_px"] == pytest.approx(1.0, abs=0.3)
+
+
+# --- scale
+
+
+def scale_of(error: float, bend_m_s: float, seconds: float = 20.0) -> ScaleCheck:
+    """Velocities that swing by ``bend_m_s``, gravity's line in their integral, and noise on the batches."""
+    rng = np.random.default_rng(3)
+    check = ScaleCheck()
+    for t in np.arange(0.0, seconds, 0.02):
+        v = np.array([3.0, 0.5, 1.0]) + bend_m_s * np.sin(np.array([2.0, 2.7, 1.3]) * t)
+        s_L = v + np.array([0.4, 9.7, 1.0]) * t + 7.0
+        check.add(int(t * 1e9), s_L, (1.0 + error) * v - s_L + rng.normal(0.0, 0.05, 3))
+    return check
+
+
+@pytest.mark.parametrize("error", [-0.03, 0.0, 0.01])
+def test_the_scale_is_seen_where_the_velocity_swings(error: float) -> None:
+    scale = scale_of(error, bend_m_s=1.0).scale()
+    assert scale is not None
+    assert scale.sigma < 0.004
+    assert abs(scale.error - error) < 4 * scale.sigma
+
+
+def test_uniform_motion_says_little_of_the_scale() -> None:
+    scale = scale_of(0.03, bend_m_s=0.0).scale()
+    assert scale is not None
+    assert scale.sigma > 0.1 or abs(scale.error) < 3 * scale.sigma
+
+
+def test_a_hole_or_a_new_count_of_the_integral_begins_a_new_span() -> None:
+    check = ScaleCheck()
+    for k in range(int(3 * SPAN_S / 0.02)):
+        jump = 100.0 * (k // 60)
+        check.add(20_000_000 * k, np.full(3, jump), np.zeros(3))
+    assert check.scale() is None
+
+
+@pytest.mark.parametrize(("baseline", "alarm"), [(1.0, False), (1.03, True)])
+def test_a_baseline_that_is_3_percent_wrong_raises_an_alarm_within_16_s(baseline: float, alarm: bool) -> None:
+    calibration = replace(synthetic.CALIBRATION, t_RL=synthetic.CALIBRATION.t_RL * baseline)
+    stage = OptimizerStage(Settings(), calibration)
+    for message in synthetic.messages(synthetic.FLIGHT, 16.0, flows=60, period_s=0.03):
+        if isinstance(message, DepthBatch):
+            depth = (message.inv_depth / np.float32(baseline), message.sigma / np.float32(baseline))
+            message = replace(message, inv_depth=depth[0], sigma=depth[1])
+        stage.handle(message)
+    assert (SCALE in stage.alarms) == alarm
+    sigma = stage.gauges["calibration.scale_sigma_percent"]
+    assert sigma < 0.8
+    assert abs(stage.gauges["calibration.scale_percent"] - 100.0 * (baseline - 1.0)) < 4 * sigma

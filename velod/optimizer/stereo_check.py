@@ -1,0 +1,156 @@
+"""Do the rows and the clocks of the two cameras agree? Seen from the disparities of neighbouring edges.
+
+Two edges of one surface, close together, have nearly one disparity, whichever way they lean. An error of the rig
+parts them: a right image that lies ``row_px`` lower is matched along the row at another place of a leaning edge, and
+a right clock that is ``clock_s`` late sees every edge where it was before. So, over pairs of neighbours,
+
+    d_i - d_j = clock_s (u_i - u_j) - row_px (k_i - k_j),    u = speed / n_x,  k = n_y / n_x,
+
+where u is the speed at which the edge runs along the row and k its lean. Depth that differs between neighbours is
+noise of either sign; pairs across a step of depth have little weight. Where all edges run along the rows equally fast
+(a sideways slide) the clocks cannot be told: then nothing is said of them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from velod.optimizer.flow_equation import pairs
+from velod.types import F64, DepthBatch, FlowBatch
+
+NEAR_PX = 12.0
+MIN_NORMAL_X = 0.3
+"""Edges flatter than this have too uncertain a place on the row."""
+MAX_PAIRS = 4096
+MIN_PAIRS = 30
+ROUNDS = 5
+HELD = 120
+"""Batches that count, a few seconds."""
+MIN_BATCHES = 12
+SIGNAL = 2.0
+"""Spread of u (variance) over what its own noise explains, above which it tells of the clocks."""
+REPEATED = 2.0
+"""Batches that follow each other see the same edges: their scatter is multiplied by this."""
+LEAST_SIGMA = np.array([1e-5, 1e-3])
+
+
+@dataclass(frozen=True, slots=True)
+class StereoOffsets:
+    """Right against left; a sigma is inf where nothing can be said."""
+
+    clock_s: float  # the right camera's stamps are so much later
+    clock_sigma_s: float
+    row_px: float  # the right image lies so much lower
+    row_sigma_px: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Sums:
+    """Of one batch: normal equations of [clock_s, row_px], and the part of H[0, 0] that noise explains."""
+
+    H: F64  # (2, 2)
+    h: F64  # (2,)
+    noise: float
+
+
+class StereoCheck:
+    """Takes batches of flow and depth, and says what they say of the rig."""
+
+    def __init__(self) -> None:
+        self._held: deque[_Sums] = deque(maxlen=HELD)
+        self._buffer = np.empty((MAX_PAIRS, 5))
+
+    def add(self, flow: FlowBatch, depth: DepthBatch) -> None:
+        """Take in a batch; one without enough pairs of neighbouring edges says nothing."""
+        at_flow, at_depth = pairs(flow.index, depth.index)
+        n = flow.n[at_flow].astype(np.float64)
+        used = (depth.refined[at_depth] > 0) & (np.abs(n[:, 0]) > MIN_NORMAL_X)
+        at_flow, at_depth, n = at_flow[used], at_depth[used], n[used]
+        speed = flow.speed[at_flow].astype(np.float64)
+        u = speed / n[:, 0]
+        sigma_u = np.abs(u) * (flow.sigma[at_flow] / speed) / np.abs(n[:, 0])
+        count = _neighbours(
+            flow.x[at_flow].astype(np.float64), flow.y[at_flow].astype(np.float64), n,
+            depth.disparity[at_depth].astype(np.float64), u, sigma_u, self._buffer,
+        )  # fmt: skip
+        if count < MIN_PAIRS:
+            return
+        H, h = np.zeros((2, 2)), np.zeros(2)
+        noise = _robust_sums(self._buffer[:count], H, h)
+        self._held.append(_Sums(H, h, noise))
+
+    def offsets(self) -> StereoOffsets | None:
+        """What the newest batches say together; None before there are enough of them."""
+        if len(self._held) < MIN_BATCHES:
+            return None
+        H = np.array([s.H for s in self._held])
+        h = np.array([s.h for s in self._held])
+        total = H.sum(axis=0)
+        noise = sum(s.noise for s in self._held)
+        if total[0, 0] < SIGNAL * noise or not np.linalg.det(total) > 1e-3 * total[0, 0] * total[1, 1]:
+            row, sigma = _solve(H[:, 1:, 1:], h[:, 1:])
+            return StereoOffsets(0.0, math.inf, float(row[0]), float(max(sigma[0], LEAST_SIGMA[1])))
+        x, sigma = _solve(H, h)
+        sigma = np.maximum(sigma, LEAST_SIGMA)
+        return StereoOffsets(float(x[0]), float(sigma[0]), float(x[1]), float(sigma[1]))
+
+
+def _solve(H: F64, h: F64) -> tuple[F64, F64]:
+    """Solution (k,) of the sums of H (m, k, k) and h (m, k), and its sigma from how the batches differ."""
+    inverse = np.linalg.inv(H.sum(axis=0))
+    x = inverse @ h.sum(axis=0)
+    g = h - H @ x
+    return x, np.sqrt(REPEATED * np.diag(inverse @ (g.T @ g) @ inverse))
+
+
+@njit(cache=True, nogil=True)
+def _neighbours(x: F64, y: F64, n: F64, disparity: F64, u: F64, sigma_u: F64, out: F64) -> int:
+    """Rows (d_i - d_j, u_i - u_j, -(k_i - k_j), sigma shape, variance of the second by noise); returns how many."""
+    m = 0
+    for i in range(x.size):
+        k_i = n[i, 1] / n[i, 0]
+        for j in range(i):
+            if m < out.shape[0] and abs(x[i] - x[j]) < NEAR_PX and abs(y[i] - y[j]) < NEAR_PX:
+                out[m, 0] = disparity[i] - disparity[j]
+                out[m, 1] = u[i] - u[j]
+                out[m, 2] = n[j, 1] / n[j, 0] - k_i
+                # The sigma of a refined disparity goes with 1 / n_x.
+                out[m, 3] = math.hypot(1.0 / n[i, 0], 1.0 / n[j, 0])
+                out[m, 4] = sigma_u[i] ** 2 + sigma_u[j] ** 2
+                m += 1
+    return m
+
+
+@njit(cache=True, nogil=True)
+def _robust_sums(rows: F64, H: F64, h: F64) -> float:
+    """Normal equations of the rows by ``_neighbours``, weighted by their own solution; returns H[0, 0] of noise."""
+    size = np.empty(rows.shape[0])
+    clock, row, noise = 0.0, 0.0, 0.0
+    for _ in range(ROUNDS):
+        for i in range(size.size):
+            size[i] = abs(rows[i, 0] - clock * rows[i, 1] - row * rows[i, 2]) / rows[i, 3]
+        scale = max(2.0 * np.median(size), 1e-3)
+        H[:] = 0.0
+        h[:] = 0.0
+        noise = 0.0
+        for i in range(size.size):
+            # Cauchy's weight: a step of depth counts little, but a first solution far off still finds the way.
+            w = 1.0 / (1.0 + (size[i] / scale) ** 2) / (rows[i, 3] * scale) ** 2
+            H[0, 0] += w * rows[i, 1] * rows[i, 1]
+            H[0, 1] += w * rows[i, 1] * rows[i, 2]
+            H[1, 1] += w * rows[i, 2] * rows[i, 2]
+            h[0] += w * rows[i, 1] * rows[i, 0]
+            h[1] += w * rows[i, 2] * rows[i, 0]
+            noise += w * rows[i, 4]
+        H[1, 0] = H[0, 1]
+        det = H[0, 0] * H[1, 1] - H[0, 1] * H[0, 1]
+        if not det > 1e-9 * H[0, 0] * H[1, 1]:
+            break
+        clock = (H[1, 1] * h[0] - H[0, 1] * h[1]) / det
+        row = (H[0, 0] * h[1] - H[0, 1] * h[0]) / det
+    return noise
