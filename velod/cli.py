@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
-from velod import __version__, cli_network
+from velod import __version__, cli_network, cli_prove
 from velod.cli_exit import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE, RunFailed
 from velod.cli_sim import add_options as add_sim_options
 
@@ -192,6 +192,7 @@ first steps:
         _add_router,
         _add_config,
         _add_bench,
+        _add_prove,
         _add_warmup,
     ):
         add(commands)
@@ -490,6 +491,23 @@ def _add_bench(commands: _Commands[argparse.ArgumentParser]) -> None:
         "group", nargs="?", default="all", choices=_BENCHES, metavar="GROUP", help=", ".join(_BENCHES)
     )
     parser.add_argument("--json", metavar="OUT", help="write the results; - for stdout")
+
+
+def _add_prove(commands: _Commands[argparse.ArgumentParser]) -> None:
+    parser = _plain(
+        commands.add_parser,
+        "prove",
+        help="What is claimed of hostile networks, load and time, tried out here.",
+        description="Each is a trial on this machine alone, over loopback, and ends with what it saw; exits with 1\n"
+        "where that is not as claimed.",
+        epilog="examples:\n  velod prove attacks        no certificate, forged velocity, floods, garbage, ...",
+    )
+    actions = parser.add_subparsers(title="trials", metavar="TRIAL", required=True)
+
+    def action(name: str, what: str) -> argparse.ArgumentParser:
+        return actions.add_parser(name, help=what, description=f"{what[0].upper()}{what[1:]}.")
+
+    cli_prove.add_actions(action)
 
 
 def _add_warmup(commands: _Commands[argparse.ArgumentParser]) -> None:

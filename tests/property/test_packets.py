@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 
 import numpy as np
@@ -10,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from velod.io import Chunking, EventColumns, Imu
-from velod.io.packets import packets
+from velod.io.packets import packets, repeated
 from velod.types import EventPacket, ImuPacket
 
 
@@ -86,3 +87,21 @@ def test_a_chunking_is_read_from_text(text: str, chunking: Chunking) -> None:
 def test_nonsense_for_a_chunking_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match="expected a rate"):
         Chunking.parse(text)
+
+
+@given(times, times, chunkings)
+def test_a_repeated_recording_is_one_stream_that_goes_on(
+    left: list[int], right: list[int], chunking: Chunking
+) -> None:
+    t_ns = np.arange(2_000_000, 61_000_000, 5_000_000)
+    imu = Imu(t_ns, np.zeros((len(t_ns), 3)), np.zeros((len(t_ns), 3)))
+    once = list(packets(Source(left), Source(right), imu, int(t_ns[0]), 61_000_000, chunking))
+    thrice = list(repeated(once, 3))
+    for stream in ("left", "right", "imu"):
+        part = [p for p in thrice if (p.camera if isinstance(p, EventPacket) else "imu") == stream]
+        assert [p.seq for p in part] == list(range(len(part)))
+        assert all(a.t_ns <= b.t_ns for a, b in itertools.pairwise(part))
+        sent = [p.sample_t_ns if isinstance(p, ImuPacket) else p.event_t_ns for p in part]
+        assert (np.diff(np.concatenate(sent)) >= 0).all()
+        assert all(b[0] >= a.t_ns for a, b in zip(part, sent[1:], strict=False) if len(b)), "watermarks hold"
+    assert sum(len(p.x) for p in thrice if isinstance(p, EventPacket)) == 3 * (len(left) + len(right))

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,6 +13,9 @@ from velod.types import NS_PER_S, EventPacket, ImuPacket
 
 FINAL_WATERMARK_NS = 25_000_000
 """The last, empty packet of each camera says that nothing happens until so long after the recording's end."""
+
+_SEAM_NS = 5_000_000
+"""Between the last moment of a recording and the first of its repetition: a sample of an IMU of 200 Hz."""
 
 _RANDOM_SPAN_NS = (200_000, 20_000_000)
 _ORDER = {"imu": 0, "left": 1, "right": 2}
@@ -55,8 +58,37 @@ def packets(
     return heapq.merge(*streams, key=_sort_key)
 
 
+def repeated(once: Sequence[EventPacket | ImuPacket], times: float) -> Iterator[EventPacket | ImuPacket]:
+    """The packets of a recording, again and again as one stream of ``times`` rounds (inf: endless).
+
+    Sensor time and ``seq`` go on from round to round; what the sensors see leaps back to the beginning.
+    """
+    start_ns = min(int(p.sample_t_ns[0]) if isinstance(p, ImuPacket) else p.t_ns for p in once)
+    # The empty packets at the end hold for a time that belongs to the next round.
+    end_ns = max(p.t_ns for p in once) - FINAL_WATERMARK_NS
+    body = [p for p in once if p.t_ns <= end_ns + 1]
+    sent = {stream: sum(_stream(p) == stream for p in body) for stream in _ORDER}
+    n = 0
+    while n < times:
+        shift_ns = n * (end_ns - start_ns + _SEAM_NS)
+        for p in once if n + 1 >= times else body:
+            yield _later(p, shift_ns, n * sent[_stream(p)])
+        n += 1
+
+
+def _later(packet: EventPacket | ImuPacket, shift_ns: int, shift_seq: int) -> EventPacket | ImuPacket:
+    seq, t_ns = packet.seq + shift_seq, packet.t_ns + shift_ns
+    if isinstance(packet, ImuPacket):
+        return replace(packet, seq=seq, t_ns=t_ns, sample_t_ns=packet.sample_t_ns + shift_ns)
+    return replace(packet, seq=seq, t_ns=t_ns, event_t_ns=packet.event_t_ns + shift_ns)
+
+
+def _stream(packet: EventPacket | ImuPacket) -> str:
+    return packet.camera if isinstance(packet, EventPacket) else "imu"
+
+
 def _sort_key(packet: EventPacket | ImuPacket) -> tuple[int, int]:
-    return packet.t_ns, _ORDER[packet.camera if isinstance(packet, EventPacket) else "imu"]
+    return packet.t_ns, _ORDER[_stream(packet)]
 
 
 def _edges(start_ns: int, end_ns: int, chunking: Chunking, stream: str) -> Iterator[int]:

@@ -56,7 +56,7 @@ def make_keys(
         authority = new_authority()
         written += write_pair(files.ca, files.ca_key, authority.certificate, authority.key)
     else:
-        authority = _load_authority(files)
+        authority = read_authority(files.folder)
     wanted = [(files, SERVER, "")]
     wanted += [(files, role, "") for role in ROLES]
     wanted += [(KeyPaths(files.folder / rig), role, rig) for rig in rigs for role in ROLES]
@@ -84,6 +84,18 @@ def new_authority() -> Authority:
     builder = builder.add_extension(usage, critical=True)
     builder = builder.add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
     return Authority(builder.sign(key, hashes.SHA256()), key)
+
+
+def read_authority(folder: str | Path) -> Authority:
+    """The CA in a folder, with its key. Raises CertificateError."""
+    files = KeyPaths(Path(folder))
+    certificate = _read(files.ca)
+    _check_dates(certificate, files.ca)
+    _check_key(files.ca_key, certificate, files.ca)
+    key = serialization.load_pem_private_key(files.ca_key.read_bytes(), None)
+    if not isinstance(key, ec.EllipticCurvePrivateKey):
+        raise CertificateError(f"{files.ca_key}: not an elliptic-curve key, which velod's own CA has")
+    return Authority(certificate, key)
 
 
 def new_certificate(
@@ -174,16 +186,6 @@ def _read(path: Path) -> x509.Certificate:
         raise CertificateError(f"{path}: {e.strerror}; `velod config keys` makes certificates") from None
     except ValueError:
         raise CertificateError(f"{path}: not a certificate (PEM)") from None
-
-
-def _load_authority(files: KeyPaths) -> Authority:
-    certificate = _read(files.ca)
-    _check_dates(certificate, files.ca)
-    _check_key(files.ca_key, certificate, files.ca)
-    key = serialization.load_pem_private_key(files.ca_key.read_bytes(), None)
-    if not isinstance(key, ec.EllipticCurvePrivateKey):
-        raise CertificateError(f"{files.ca_key}: not an elliptic-curve key, which velod's own CA has")
-    return Authority(certificate, key)
 
 
 def _common_name(certificate: x509.Certificate) -> str:

@@ -22,7 +22,7 @@ import zenoh
 from velod.config import ZenohSettings
 from velod.geometry.calibration import load_calibration
 from velod.io import open_recording
-from velod.io.packets import Chunking
+from velod.io.packets import Chunking, repeated
 from velod.runtime.health import HealthReporter
 from velod.runtime.outlet import Outlet
 from velod.runtime.prefetch import Prefetch
@@ -249,6 +249,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--packets", type=_chunking, default=Chunking(), help="200hz, 1000hz, 60hz, random, random:SEED"
     )
+    parser.add_argument("--repeat", type=float, default=1.0, metavar="N", help="rounds, inf: for ever (default 1)")
     parser.add_argument("--calibration", metavar="FILE", help="in place of the recording's own, which it may lack")
     args = parser.parse_args(argv)
     start_logging(args.worker)
@@ -257,11 +258,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         stop = stop_on_signals()
         calibration = load_calibration(args.calibration) if args.calibration else None
         packets = open_recording(args.recording, calibration=calibration).packets(args.packets)
-        ahead = Prefetch(packets)
-        if args.speed is not None:
-            ahead.fill(PREFETCH_S)
+        if args.repeat == 1.0:
+            ahead = Prefetch(packets)
+            if args.speed is not None:
+                ahead.fill(PREFETCH_S)
+        stream = ahead if args.repeat == 1.0 else repeated(list(packets), args.repeat)
         with open_session(zenoh_settings(args)) as session:
-            play(session, args.rig, ahead, args.speed, stop, args.worker)
+            play(session, args.rig, stream, args.speed, stop, args.worker)
     except PlayerError as e:
         log.error("%s", e)
         return 1
