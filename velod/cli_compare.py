@@ -4,82 +4,94 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
-
-import numpy as np
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 from velod import __version__
+from velod.cli_cases import Outcome, SequenceJob, judge_recording
 from velod.cli_config import calibration_of, settings_of
 from velod.cli_exit import RunFailed
+from velod.cli_jobs import commit, run_jobs
 from velod.cli_report import Line, progress_bar, write_json
-from velod.cli_stages import stages_of, true_depth_of
+from velod.cli_stages import true_depth_of
 from velod.config import Settings
-from velod.eval.baselines import benosman_settings, integrate_imu, paper_settings
-from velod.eval.compare import Case, compare, judge
 from velod.eval.floor import with_perfect_flow_and_depth
-from velod.eval.front_end import FrontEnd, SecondFlow, estimate
+from velod.eval.front_end import FrontEnd, estimate
+from velod.eval.markdown import put_into
 from velod.eval.metrics import evaluate
-from velod.eval.report import Report, StageTimes
-from velod.eval.stage_errors import StageErrors
-from velod.eval.stage_tables import group_tables, overview_tables
-from velod.eval.table import Row, as_json, ave_table, detail_table, notes, rve_table, text_table
-from velod.io import Imu, Recording, open_recording
-from velod.types import DepthBatch, EventBatch, EventPacket, FlowBatch, ImuPacket, Message, StereoBatch
+from velod.eval.report import Report
+from velod.eval.table import all_tables, as_json, more_tables, notes, text_table
+from velod.io import Recording, open_recording
 
-_EVENT_SEED = 1
 _SEEDS = (1, 2, 3, 4, 5)
 _QUICK_SEEDS = (1,)
-_SECONDS = {"corridor": 10.0, "boxes": 10.0, "spin": 3.0}
-_QUICK_SECONDS = {"corridor": 1.0, "boxes": 1.0, "spin": 0.6}
+_SECONDS = {"spin": 3.0}
+_QUICK_SECONDS = {"spin": 0.6}
+_OTHER_SECONDS, _OTHER_QUICK_SECONDS = 10.0, 1.0
 # As long as the paper's must have been for its errors of IMU integration (DESIGN 4.14).
-_IMU_SECONDS = {"corridor": 90.0, "boxes": 30.0, "spin": 30.0}
+_IMU_SECONDS = {"corridor": 90.0}
+_OTHER_IMU_SECONDS = 30.0
+_IMU_NOISES, _QUICK_IMU_NOISES = 100, 20
 
 
-def compare_sequences(config: str | None, *, quick: bool, json: str | None, report: str | None) -> int:
-    """The synthetic sequences of Table I. Raises RunFailed where one yields no valid velocity."""
-    from velod.sim import TABLE_I
+@dataclass(frozen=True, slots=True)
+class Output:
+    """Where the results go; None: nowhere."""
 
+    json: str | None = None  # - for stdout
+    report: str | None = None  # a directory
+    markdown: str | None = None  # a file in which the block of these tables is replaced
+
+
+@dataclass(frozen=True, slots=True)
+class TableOptions:
+    """What ``--table`` runs, and how."""
+
+    table: str  # "synthetic" or "held-out"
+    quick: bool = False
+    event_seed: int = 1
+    texture_seed: int | None = None
+    processes: int = 2
+
+    @property
+    def command(self) -> str:
+        """What can be typed to have it again."""
+        parts = ["velod eval --table", self.table, "--quick" if self.quick else ""]
+        parts.append(f"--seed {self.event_seed}" if self.event_seed != 1 else "")
+        parts.append(f"--texture {self.texture_seed}" if self.texture_seed is not None else "")
+        return " ".join(part for part in parts if part)
+
+
+def compare_sequences(config: str | None, options: TableOptions, output: Output) -> int:
+    """Simulated sequences. Raises RunFailed where one fails, or yields no valid velocity."""
+    from velod.sim import HELD_OUT, TABLE_I
+
+    names = TABLE_I if options.table == "synthetic" else HELD_OUT
     settings = settings_of(config)
-    seeds = _QUICK_SEEDS if quick else _SEEDS
-    lengths = _QUICK_SECONDS if quick else _SECONDS
-    # Within the command's own name: what made the page can be typed again.
-    command = "velod eval --table synthetic" + (" --quick" if quick else "")
-    page = None if report is None else Report(report, f"{command} (velod {__version__})")
-    rows = []
-    progress = _Progress(len(TABLE_I))
-    for name in TABLE_I:
-        seconds = lengths[name.split("-")[0]]
-        rows.append(_simulated_row(settings, name, seconds, seeds, progress, page))
-        progress.next()
-    progress.finish()
-    return _finish(rows, seeds, json, page)
+    seeds = _QUICK_SEEDS if options.quick else _SEEDS
+    page = None if output.report is None else Report(output.report, _made_by(options.command))
+    jobs = [_job(name, settings, options, seeds, draw=page is not None) for name in names]
+    return _finish(run_jobs(jobs, options.processes), seeds, output, page, options.command)
 
 
-def compare_files(
-    config: str | None, files: Sequence[str], json: str | None, report: str, calibration: str | None = None
-) -> int:
+def compare_files(config: str | None, files: Sequence[str], output: Output, calibration: str | None = None) -> int:
     """Recordings that hold the truth. Raises RunFailed where one yields no valid velocity."""
     settings = settings_of(config, calibration)
-    page = Report(report, f"velod eval {' '.join(files)} --report (velod {__version__})")
-    rows = []
-    progress = _Progress(len(files))
-    for file in files:
+    command = f"velod eval {' '.join(files)} --report"
+    page = None if output.report is None else Report(output.report, _made_by(command))
+    outcomes = []
+    for at, file in enumerate(files):
         recording = open_recording(file, calibration=calibration_of(settings))
         if recording.truth is None:
             raise ValueError(f"{file}: holds no truth to judge against")
-        case, times = _run(settings, recording, recording.path.stem, [recording.imu], progress)
-        judgement = compare(case, settings, progress.say)
-        row = Row(case.name, recording.duration_s, judgement, stages=_stage_errors(settings, recording, case))
-        page.add(row, case, recording.left, times)
-        rows.append(row)
-        progress.next()
-    progress.finish()
-    return _finish(rows, (), json, page)
+        name, line = recording.path.stem, _OneLine(f"{at + 1}/{len(files)} {recording.path.stem}")
+        outcomes.append(judge_recording(name, settings, recording, [recording.imu], line.show, draw=page is not None))
+        line.finish()
+    return _finish(outcomes, (), output, page, command)
 
 
 def floor_mps(settings: Settings, recording: Recording) -> float | None:
-    """AVE of the back end on perfect flow and depth, m/s; None unless the recording is a simulated one."""
+    """AVE of the back end on perfect flow and depth, m/s; None where the recording does not hold the true depth."""
     true_depth = true_depth_of(recording)
     if true_depth is None or recording.truth is None:
         return None
@@ -92,153 +104,65 @@ def floor_mps(settings: Settings, recording: Recording) -> float | None:
     return evaluate(velocities, recording.truth, recording.t_start_ns).ave_mps
 
 
-def _simulated_row(
-    settings: Settings, name: str, seconds: float, seeds: Sequence[int], progress: _Progress, page: Report | None
-) -> Row:
-    from velod.sim import sequence, simulated_recording
-    from velod.sim.imu import sample_imu
-    from velod.sim.run import true_motion
-
-    recipe = sequence(name)
-
-    def imus(seconds: float) -> list[Imu]:
-        return [sample_imu(recipe.trajectory, recipe.imu, seconds, np.random.default_rng((k, 0))) for k in seeds]
-
-    path = simulated_recording(name, seconds, _EVENT_SEED, lambda share: progress.show(f"{name}: simulating", share))
-    recording = open_recording(path)
-    case, times = _run(settings, recording, name, imus(seconds), progress)
-    judgement = compare(case, settings, progress.say)
-    imu_seconds = _IMU_SECONDS[name.split("-")[0]]
-    progress.say(f"{name}: IMU alone over {imu_seconds:g} s")
-    truth = true_motion(recipe.trajectory, imu_seconds)
-    long = tuple(judge(integrate_imu(imu, truth, settings), imu, truth, 0) for imu in imus(imu_seconds))
-    row = Row(name, seconds, judgement, imu_seconds, long, _stage_errors(settings, recording, case))
-    if page is not None:
-        page.add(row, case, recording.left, times)
-    return row
+def _job(name: str, settings: Settings, options: TableOptions, seeds: tuple[int, ...], *, draw: bool) -> SequenceJob:
+    kind = name.split("-")[0]
+    lengths, other = (_QUICK_SECONDS, _OTHER_QUICK_SECONDS) if options.quick else (_SECONDS, _OTHER_SECONDS)
+    return SequenceJob(
+        name=name,
+        settings=settings,
+        seconds=lengths.get(kind, other),
+        event_seed=options.event_seed,
+        texture_seed=options.texture_seed,
+        imu_seeds=seeds,
+        imu_seconds=_IMU_SECONDS.get(kind, _OTHER_IMU_SECONDS),
+        imu_noises=_QUICK_IMU_NOISES if options.quick else _IMU_NOISES,
+        draw=draw,
+    )
 
 
-def _run(
-    settings: Settings, recording: Recording, name: str, imus: Sequence[Imu], progress: _Progress
-) -> tuple[Case, StageTimes]:
-    """Both front ends, velod's and the paper-like one, over a recording."""
-    from velod.runtime.offline import run_offline
-    from velod.runtime.warmup import fill_cache
-
-    assert recording.truth is not None, "the callers have looked"
-    calibration, paper = recording.calibration, paper_settings(settings)
-    fill_cache(settings, calibration)
-    own, like_paper, clock = FrontEnd(), FrontEnd(), _Clock()
-    benosman = SecondFlow(benosman_settings(settings), calibration)
-
-    def note(message: Message) -> None:
-        clock.stop(message)
-        own.note(message)
-        benosman.note(message)
-        clock.start(message)
-
-    packets = progress.along(recording, f"{name}: velod's front end")
-    run_offline(settings, calibration, packets, note)
-    begin_s = time.perf_counter()
-    estimate(own, settings, calibration)
-    back_end_s = time.perf_counter() - begin_s
-    packets = progress.along(recording, f"{name}: paper-like front end")
-    run_offline(paper, calibration, packets, like_paper.note)
-    case = Case(
-        name, calibration, recording.truth, recording.t_start_ns, imus,
-        own, benosman.in_place_of(own), like_paper, true_depth_of(recording),
-    )  # fmt: skip
-    return case, clock.per_batch(len(own.selected), back_end_s)
+def _made_by(command: str) -> str:
+    return f"{command} (velod {__version__}, {commit()})"
 
 
-def _stage_errors(settings: Settings, recording: Recording, case: Case) -> StageErrors | None:
-    """Of velod's front end; None where the truth of it is not known."""
-    return None if case.true_depth is None else stages_of(settings, recording, case.own, case.true_depth)
-
-
-def _finish(rows: Sequence[Row], seeds: Sequence[int], json: str | None, page: Report | None) -> int:
-    tables = {
-        "AVE, m/s": ave_table(rows),
-        "RVE (Eq. 16), %": rve_table(rows),
-        "velod's own estimate, and dead reckoning": detail_table(rows),
-        **overview_tables({row.name: row.stages for row in rows}),
-    }
+def _finish(
+    outcomes: Sequence[Outcome], seeds: Sequence[int], output: Output, page: Report | None, command: str
+) -> int:
+    rows = [outcome.row for outcome in outcomes]
+    tables, said = all_tables(rows), notes(rows, seeds)
     text = "\n\n".join(f"{title}\n{text_table(lines)}" for title, lines in tables.items())
     # With --json - the table must not get into the JSON.
-    print(f"{text}\n\n" + "\n".join(notes(rows, seeds)), file=sys.stderr if json == "-" else sys.stdout)
-    if json is not None:
-        write_json(json, {"velod": __version__, **as_json(rows, seeds)})
+    print(f"{text}\n\n" + "\n".join(said), file=sys.stderr if output.json == "-" else sys.stdout)
+    if output.json is not None:
+        write_json(
+            output.json, {"velod": __version__, "commit": commit(), "command": command, **as_json(rows, seeds)}
+        )
+    if output.markdown is not None:
+        put_into(output.markdown, command, commit(), tables)
+        print(f"wrote {output.markdown}", file=sys.stderr)
     if page is not None:
-        tables |= group_tables({row.name: row.stages for row in rows})
-        print(f"wrote {page.finish(tables, notes(rows, seeds))}", file=sys.stderr)
+        for outcome in outcomes:
+            assert outcome.section is not None, "drawn for the page"
+            page.add(outcome.section)
+        print(f"wrote {page.finish({**tables, **more_tables(rows)}, said)}", file=sys.stderr)
     failed = [row.name for row in rows if not all(j.ever_valid for j in row.judgement["velod"])]
     if failed:
         raise RunFailed(f"{', '.join(failed)}: no valid velocity")
     return 0
 
 
-@dataclass(slots=True)
-class _Clock:
-    """Host time that flow and depth take, from the moments at which ``run_offline`` reports messages."""
+class _OneLine:
+    """What is being done with one recording, on a terminal."""
 
-    flow_s: float = 0.0
-    depth_s: float = 0.0
-    _last_s: float = field(default_factory=time.perf_counter)
-    _last: Message | None = None
-    _noted_s: float = 0.0  # spent on taking notes
-    _begin_s: float = field(default_factory=time.perf_counter)
-
-    def stop(self, message: Message) -> None:
-        """A message has come."""
-        now = time.perf_counter()
-        if isinstance(self._last, EventBatch) and isinstance(message, FlowBatch):
-            self.flow_s += now - self._last_s
-        elif isinstance(self._last, StereoBatch) and isinstance(message, DepthBatch):
-            self.depth_s += now - self._last_s
-        self._last_s = now
-
-    def start(self, message: Message) -> None:
-        """The message has been noted, and goes on its way."""
-        now = time.perf_counter()
-        self._noted_s += now - self._last_s
-        self._last, self._last_s = message, now
-
-    def per_batch(self, batches: int, back_end_s: float) -> StageTimes:
-        """All that is neither flow, depth nor back end is preprocessing, reading the file included."""
-        total_s = self._last_s - self._begin_s - self._noted_s
-        rest_s = total_s - self.flow_s - self.depth_s - back_end_s
-        per_ms = 1e3 / max(1, batches)
-        return StageTimes(rest_s * per_ms, self.flow_s * per_ms, self.depth_s * per_ms, back_end_s * per_ms)
-
-
-class _Progress:
-    """One line on a terminal: which of the sequences, what is being done, and how far that is."""
-
-    def __init__(self, count: int) -> None:
-        self._count, self._at = count, 1
-        self._line = Line()
+    def __init__(self, name: str) -> None:
+        self._name, self._line = name, Line()
         self._what, self._since_s = "", time.monotonic()
 
     def show(self, what: str, share: float) -> None:
         if what != self._what:
             self._what, self._since_s = what, time.monotonic()
         if self._line.due():
-            bar = progress_bar(share, time.monotonic() - self._since_s, width=20)
-            self._line.draw(f"{self._at}/{self._count} {what} {bar}")
-
-    def say(self, what: str) -> None:
-        if self._line.enabled:
-            self._line.draw(f"{self._at}/{self._count} {what}")
-
-    def along(self, recording: Recording, what: str) -> Iterator[EventPacket | ImuPacket]:
-        """The packets of a recording, while the bar grows."""
-        length_ns = max(1, recording.t_end_ns - recording.t_start_ns)
-        for packet in recording.packets():
-            yield packet
-            self.show(what, (packet.t_ns - recording.t_start_ns) / length_ns)
-
-    def next(self) -> None:
-        self._at += 1
+            bar = progress_bar(share, time.monotonic() - self._since_s, width=20) if share == share else ""
+            self._line.draw(f"{self._name}: {what} {bar}")
 
     def finish(self) -> None:
         self._line.finish()

@@ -5,16 +5,31 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from velod.eval.compare import METHODS, Judged, Judgement, judge
+from velod.eval.imu_alone import ImuAlone
+from velod.eval.markdown import MarkdownError, put_into
 from velod.eval.metrics import evaluate
 from velod.eval.paper import PAPER, TABLE_IV_MS
 from velod.eval.stage_errors import DepthErrors, FlowErrors, Group, StageErrors
 from velod.eval.stage_tables import group_tables, overview_tables
-from velod.eval.table import Row, as_json, ave_table, detail_table, notes, rve_table, spread, text_table
+from velod.eval.table import (
+    Row,
+    as_json,
+    ave_table,
+    detail_table,
+    imu_table,
+    notes,
+    paper_table,
+    quartile_table,
+    rve_table,
+    spread,
+    text_table,
+)
 from velod.io.model import Imu, Truth
 from velod.types import Velocity
 
@@ -41,7 +56,7 @@ def judged(error_mps: float, valid: bool = True) -> Judged:
 
 def row(name: str = "corridor-1", **errors: list[float]) -> Row:
     judgement: Judgement = {method: [judged(e) for e in values] for method, values in errors.items()}
-    return Row(name, 10.0, judgement, 90.0, (judged(3.0),))
+    return Row(name, 10.0, judgement, ImuAlone((30.0, 90.0), np.array([[0.5, 2.0], [1.0, 4.0]])))
 
 
 def cell(table: list[list[str]], column: str, line: int = 1) -> str:
@@ -69,7 +84,8 @@ def test_each_method_stands_in_its_column_beside_the_papers_numbers() -> None:
     assert cell(table, "velod") == "0.040±0.014"
     assert cell(table, "linear") == "0.200"
     assert cell(table, "floor") == "-"
-    assert cell(table, "IMU long") == "3.00"
+    assert cell(table, "IMU, s") == "90"
+    assert cell(table, "IMU long") == "3.00±1.41"
     assert table[1][-4:] == ["0.09", "2.67", "10.78", "Table II"]
 
 
@@ -77,6 +93,24 @@ def test_relative_errors_stand_beside_the_papers_error_over_its_speed() -> None:
     table = rve_table([row(velod=[0.03])])
     assert cell(table, "velod") == "1.50"
     assert cell(table, "paper: AVE/speed") == "1.58"
+
+
+def test_the_quartiles_of_the_relative_error_are_the_boxes_of_fig_7() -> None:
+    table = quartile_table([row(velod=[0.03, 0.05])])
+    assert cell(table, "velod") == "2 / 2 / 2"
+    assert cell(table, "linear") == "-"
+
+
+def test_the_imu_alone_is_shown_over_time_with_how_rare_the_papers_error_is() -> None:
+    table = imu_table([row(velod=[0.03]), Row("mine", 1.0, {"velod": [judged(0.1)]})])
+    assert table[0] == ["sequence", "noises", "30 s", "90 s", "paper: IMU", "noises below it at"]
+    assert table[1:] == [["corridor-1", "2", "0.75 (0.53 - 0.97)", "3.00 (2.10 - 3.90)", "2.67", "90 s: 50 %"]]
+
+
+def test_the_papers_own_tables_are_shown_with_what_failed() -> None:
+    table = paper_table()
+    assert len(table) == 9
+    assert table[1] == ["Synthetic_1", "corridor-1", "2.67", "0.48", "1.31", "failed", "10.78", "0.09", "Table II"]
 
 
 def test_a_recording_that_the_paper_does_not_have_stands_alone() -> None:
@@ -173,3 +207,16 @@ def test_stage_errors_of_the_json_have_the_names_of_the_fields_and_null_for_the_
     assert first["stages"]["depth"]["sigmas"] is None
     assert first["stages"]["groups"]["polarity"][1]["label"] == "OFF"
     assert second["stages"] is None
+
+
+def test_tables_take_the_place_of_those_of_an_earlier_run(tmp_path: Path) -> None:
+    page = tmp_path / "results.md"
+    page.write_text("# A\n<!-- velod eval x -->\nold\n<!-- end -->\n\n<!-- velod eval y -->\n<!-- end -->\nlast\n")
+    for value in ("1", "2"):
+        put_into(page, "velod eval x", "abc123", {"T": [["name", "n"], ["a", value]]})
+    assert page.read_text() == (
+        "# A\n<!-- velod eval x -->\n`velod eval x` at `abc123`:\n\n```\nT\nname  n\na     2\n```\n<!-- end -->\n\n"
+        "<!-- velod eval y -->\n<!-- end -->\nlast\n"
+    )
+    with pytest.raises(MarkdownError, match="no place"):
+        put_into(page, "velod eval z", "abc123", {})

@@ -25,6 +25,8 @@ class Metrics:
     n: int  # velocities judged
     ave_mps: float  # mean |v_gt - v_est| (AVE)
     rve_percent: float  # mean of Eq. 16 (RVE)
+    rve_quartiles_percent: tuple[float, float, float]  # 25, 50 and 75 %
+    rve_p95_percent: float
     median_mps: float
     p95_mps: float
     max_mps: float
@@ -114,7 +116,9 @@ def evaluate(velocities: Sequence[Velocity], truth: Truth, t_start_ns: int | Non
     return Metrics(
         n=len(judged),
         ave_mps=float(error.mean()),
-        rve_percent=float(rve.mean()) if moving.any() else math.nan,
+        rve_percent=_mean(rve),
+        rve_quartiles_percent=(_percentile(rve, 25), _percentile(rve, 50), _percentile(rve, 75)),
+        rve_p95_percent=_percentile(rve, 95),
         median_mps=float(np.median(error)),
         p95_mps=float(np.percentile(error, 95)),
         max_mps=float(error.max()),
@@ -184,6 +188,11 @@ def _mean(values: np.ndarray) -> float:
     return float(values.mean()) if len(values) else math.nan
 
 
+def _percentile(values: F64, percent: float) -> float:
+    return float(np.percentile(values, percent)) if len(values) else math.nan
+
+
 def _nothing(first_valid_s: float, valid_fraction: float) -> Metrics:
-    rest = (math.nan,) * 5
-    return Metrics(0, *rest, first_valid_s, valid_fraction, *rest, math.nan)
+    nan = math.nan
+    errors = (nan, nan, (nan, nan, nan), nan, nan, nan, nan)
+    return Metrics(0, *errors, first_valid_s, valid_fraction, nan, nan, nan, nan, nan, nan)

@@ -9,7 +9,7 @@ import numpy as np
 
 from velod.eval.compare import METHODS, Case
 from velod.eval.dead_reckoning import Track
-from velod.eval.plots import PlotError
+from velod.eval.plots import figure_class
 from velod.io.model import NO_EVENTS, EventColumns, EventSource
 from velod.types import F64, I64, NS_PER_S, DepthBatch, FlowBatch
 
@@ -27,15 +27,6 @@ _COLOURS = {
 _TRAIL_PX = 4.0
 _ARROW_PX = 14.0
 _ARROWS = 220
-
-
-def figure_class() -> Any:
-    """matplotlib's Figure. Raises PlotError where it is not installed."""
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise PlotError("pictures need matplotlib: pip install 'velod[plot]'") from None
-    return Figure
 
 
 def error_over_time(name: str, errors: Mapping[str, tuple[I64, F64, F64]]) -> Any:

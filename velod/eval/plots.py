@@ -27,23 +27,21 @@ def plot_run(velocities: Sequence[Velocity], truth: Truth | None, directory: str
     shown = [v for v in velocities if v.valid]
     if not shown:
         raise PlotError(f"{name}: nothing to plot: no valid velocity")
-    figure_class = _figure_class()
     directory = Path(directory)
     directory.mkdir(parents=True, exist_ok=True)
-    figures = {"velocity": _draw_velocity(figure_class(figsize=(10, 7)), shown, truth)}
+    figures = {"velocity": velocity_figure(shown, truth, name)}
     if truth is not None:
-        figures["error"] = _draw_error(figure_class(figsize=(10, 3.5)), shown, truth)
+        figures["error"] = _error_figure(shown, truth, name)
     written = []
     for kind, figure in figures.items():
-        figure.suptitle(name)
-        figure.tight_layout()
         path = directory / f"{name}_{kind}.png"
         figure.savefig(path, dpi=120)
         written.append(path)
     return written
 
 
-def _figure_class() -> Any:
+def figure_class() -> Any:
+    """matplotlib's Figure. Raises PlotError where it is not installed."""
     try:
         from matplotlib.figure import Figure
     except ImportError:
@@ -51,7 +49,10 @@ def _figure_class() -> Any:
     return Figure
 
 
-def _draw_velocity(figure: Any, shown: Sequence[Velocity], truth: Truth | None) -> Any:
+def velocity_figure(shown: Sequence[Velocity], truth: Truth | None, name: str) -> Any:
+    """The components of valid velocities with their 3-sigma bands, and the truth."""
+    figure = figure_class()(figsize=(10, 7), layout="constrained")
+    figure.suptitle(name)
     t_s = np.array([v.t_ns for v in shown]) / NS_PER_S
     v_B = np.array([v.v_B for v in shown])
     band = 3.0 * np.sqrt(np.array([np.diag(v.cov) for v in shown]))
@@ -67,7 +68,9 @@ def _draw_velocity(figure: Any, shown: Sequence[Velocity], truth: Truth | None) 
     return figure
 
 
-def _draw_error(figure: Any, shown: Sequence[Velocity], truth: Truth) -> Any:
+def _error_figure(shown: Sequence[Velocity], truth: Truth, name: str) -> Any:
+    figure = figure_class()(figsize=(10, 3.5), layout="constrained")
+    figure.suptitle(name)
     inside = [v for v in shown if truth.t_ns[0] <= v.t_ns <= truth.t_ns[-1]]
     t_ns = np.array([v.t_ns for v in inside], dtype=np.int64)
     v_B = np.array([v.v_B for v in inside]).reshape(-1, 3)

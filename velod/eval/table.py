@@ -9,13 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from velod.eval.compare import METHODS, Judged, Judgement
+from velod.eval.compare import METHODS, Judgement
+from velod.eval.imu_alone import ImuAlone
 from velod.eval.paper import PAPER
 from velod.eval.stage_errors import StageErrors
 from velod.eval.stage_tables import as_json as stages_as_json
+from velod.eval.stage_tables import group_tables, overview_tables
 
 NONE_VALID = "*"
 REAL = "r"
+_SHOWN_GROUPS = ("by distance", "by edge direction, |n_x|")
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,8 +55,7 @@ class Row:
     name: str
     seconds: float
     judgement: Judgement
-    imu_seconds: float = math.nan  # length of the longer integration of the IMU
-    imu_long: tuple[Judged, ...] = ()
+    imu_alone: ImuAlone | None = None  # over a longer time, and many noises
     stages: StageErrors | None = None  # of velod's front end, where the truth of it is known
 
     def ave(self, method: str) -> Spread:
@@ -77,7 +79,7 @@ def ave_table(rows: Sequence[Row]) -> list[list[str]]:
 
 
 def rve_table(rows: Sequence[Row]) -> list[list[str]]:
-    """RVE of every method, %. The paper has it as box plots only; beside it stands its AVE over its mean speed."""
+    """Mean RVE of every method, %. The paper has box plots only; beside it stands its AVE over its mean speed."""
     head = ["sequence", *METHODS, "paper: AVE/speed"]
     lines = [head]
     for row in rows:
@@ -87,10 +89,64 @@ def rve_table(rows: Sequence[Row]) -> list[list[str]]:
     return lines
 
 
+def quartile_table(rows: Sequence[Row]) -> list[list[str]]:
+    """25, 50 and 75 % of the RVE, the boxes of Fig. 7, in %; means over the noises."""
+    lines = [["sequence", *METHODS]]
+    for row in rows:
+        cells = []
+        for method in METHODS:
+            quartiles = zip(*(j.metrics.rve_quartiles_percent for j in row.judgement.get(method, ())), strict=True)
+            means = [spread(values).mean for values in quartiles]
+            cells.append(" / ".join(f"{m:.3g}" for m in means) + row.marked(method) if means else "-")
+        lines.append([row.name, *cells])
+    return lines
+
+
+def imu_table(rows: Sequence[Row]) -> list[list[str]]:
+    """AVE of the IMU alone over growing times, m/s: median, and 5 to 95 % of the noises; beside it the paper's."""
+    known = [(row, row.imu_alone) for row in rows if row.imu_alone is not None]
+    steps_s = sorted({s for _, alone in known for s in alone.seconds})
+    head = ["sequence", "noises", *(f"{s:g} s" for s in steps_s), "paper: IMU", "noises below it at"]
+    lines = [head]
+    for row, alone in known:
+        by_time = dict(zip(alone.seconds, alone.quantiles((0.05, 0.5, 0.95)).T, strict=True))
+        cells = ["{1:.2f} ({0:.2f} - {2:.2f})".format(*by_time[s]) if s in by_time else "" for s in steps_s]
+        paper, beside = PAPER.get(row.name), ["", ""]
+        if paper is not None:
+            below = 100.0 * float(alone.share_below(paper.imu_mps)[-1])
+            beside = [
+                f"{paper.imu_mps:.2f}{f' {REAL}' if paper.real else ''}",
+                f"{alone.seconds[-1]:g} s: {below:.0f} %",
+            ]
+        lines.append([row.name, str(len(alone.ave_mps)), *cells, *beside])
+    return lines
+
+
+def paper_table() -> list[list[str]]:
+    """Tables II and III of the paper, AVE in m/s, whatever was judged."""
+    lines = [["paper's sequence", "ours", "IMU", "VINS-Fusion", "PR-VINS", "USLAM", "Benosman-NF", "Ours", "in"]]
+    for name, p in PAPER.items():
+        others = [f"{v:.2f}" if math.isfinite(v) else "failed" for v in p.others_mps]
+        lines.append(
+            [p.name, name, f"{p.imu_mps:.2f}", *others, f"{p.benosman_mps:.2f}", f"{p.ours_mps:.2f}", p.table]
+        )
+    return lines
+
+
 def detail_table(rows: Sequence[Row]) -> list[list[str]]:
     """What else is known of velod's own estimate, and the drift of dead reckoning, % of the distance."""
     head = [
-        *("sequence", "95 % m/s", "valid from s", "valid %", "NEES", "in 1/2/3 sigma %"),
+        *(
+            "sequence",
+            "median m/s",
+            "95 % m/s",
+            "RVE median %",
+            "95 %",
+            "valid from s",
+            "valid %",
+            "NEES",
+            "in 1/2/3 sigma %",
+        ),
         *("drift %: velod", "paper-like", "linear", "IMU"),
     ]
     lines = [head]
@@ -100,7 +156,10 @@ def detail_table(rows: Sequence[Row]) -> list[list[str]]:
         lines.append(
             [
                 row.name,
+                spread(m.median_mps for m in own).text(),
                 spread(m.p95_mps for m in own).text(),
+                spread(m.rve_quartiles_percent[1] for m in own).text(),
+                spread(m.rve_p95_percent for m in own).text(),
                 spread(m.first_valid_s for m in own).text(),
                 f"{100.0 * spread(m.valid_fraction for m in own).mean:.1f}",
                 spread(m.nees_mean for m in own).text(),
@@ -111,6 +170,31 @@ def detail_table(rows: Sequence[Row]) -> list[list[str]]:
     return lines
 
 
+def all_tables(rows: Sequence[Row]) -> dict[str, list[list[str]]]:
+    """Title -> table, in the order in which they are read."""
+    stages = {row.name: row.stages for row in rows}
+    of_imu = {"IMU alone from a true start, AVE in m/s": imu_table(rows)} if any(r.imu_alone for r in rows) else {}
+    groups = {title: lines for title, lines in group_tables(stages).items() if title.endswith(_SHOWN_GROUPS)}
+    return {
+        "AVE, m/s": ave_table(rows),
+        "RVE (Eq. 16), %": rve_table(rows),
+        "RVE: 25 / 50 / 75 % (the boxes of Fig. 7), %": quartile_table(rows),
+        "velod's own estimate, and dead reckoning": detail_table(rows),
+        **of_imu,
+        **overview_tables(stages),
+        **groups,
+    }
+
+
+def more_tables(rows: Sequence[Row]) -> dict[str, list[list[str]]]:
+    """Those that only a report has room for."""
+    groups = group_tables({row.name: row.stages for row in rows})
+    return {
+        **{title: lines for title, lines in groups.items() if not title.endswith(_SHOWN_GROUPS)},
+        "The paper's Tables II and III, AVE in m/s": paper_table(),
+    }
+
+
 def notes(rows: Sequence[Row], seeds: Sequence[int]) -> list[str]:
     """What the tables do not say by themselves."""
     count = "One noise" if len(seeds) < 2 else f"Mean ± standard deviation over {len(seeds)} noises"
@@ -118,6 +202,8 @@ def notes(rows: Sequence[Row], seeds: Sequence[int]) -> list[str]:
         f"{count} of the IMU (seeds: {', '.join(map(str, seeds)) or 'as recorded'}); the events are the same.",
         "Only the IMU's integration is given any truth: its initial velocity and attitude.",
         *(f"{name}: {what}." for name, what in METHODS.items() if name != "velod"),
+        "Latency is that of the processes, and not measured here: velod eval FILE, without --offline.",
+        *(f"{row.name}: true depth by {row.stages.how}." for row in rows if row.stages is not None),
     ]
     if any(row.marked(method) for row in rows for method in row.judgement):
         lines.append(f"{NONE_VALID} no velocity was valid in a run: all were judged.")
@@ -146,13 +232,13 @@ def _ave_line(row: Row) -> list[str]:
     if paper is not None:
         where = paper.table + (f" {REAL}" if paper.real else "")
         beside = [f"{paper.ours_mps:.2f}", f"{paper.imu_mps:.2f}", f"{paper.benosman_mps:.2f}", where]
-    long = spread(j.metrics.ave_mps for j in row.imu_long)
+    alone = row.imu_alone
     return [
         row.name,
         f"{row.seconds:g}",
         *(row.ave(m).text() + row.marked(m) for m in METHODS),
-        f"{row.imu_seconds:g}" if row.imu_long else "",
-        long.text() if row.imu_long else "",
+        "" if alone is None else f"{alone.seconds[-1]:g}",
+        "" if alone is None else spread(alone.ave_mps[:, -1]).text(),
         *beside,
     ]
 
@@ -174,13 +260,9 @@ def _row_json(row: Row) -> dict[str, Any]:
             }
             for method, runs in row.judgement.items()
         },
-        "imu_long": None
-        if not row.imu_long
-        else {
-            "seconds": row.imu_seconds,
-            "ave_mps": _spread_json(spread(j.metrics.ave_mps for j in row.imu_long)),
-            "rve_percent": _spread_json(spread(j.metrics.rve_percent for j in row.imu_long)),
-        },
+        "imu_alone": None
+        if row.imu_alone is None
+        else {"seconds": list(row.imu_alone.seconds), "ave_mps": row.imu_alone.ave_mps.tolist()},
         "stages": None if row.stages is None else stages_as_json(row.stages),
         "paper": None
         if paper is None

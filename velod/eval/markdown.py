@@ -1,0 +1,28 @@
+"""Tables written into a Markdown file, in place of those that an earlier run wrote there."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from velod.eval.table import text_table
+
+
+class MarkdownError(ValueError):
+    """A file that has no place for the tables; the text says which it looked for."""
+
+
+def put_into(path: str | Path, command: str, commit: str, tables: Mapping[str, Sequence[Sequence[str]]]) -> None:
+    """Replace what stands between ``<!-- COMMAND -->`` and ``<!-- end -->`` by the tables of that command.
+
+    Raises MarkdownError where the file has no such place, OSError where it cannot be read or written.
+    """
+    path = Path(path)
+    text, begin = path.read_text(encoding="utf-8"), f"<!-- {command} -->"
+    place = re.compile(re.escape(begin) + r".*?<!-- end -->", re.DOTALL)
+    if not place.search(text):
+        raise MarkdownError(f"{path}: there is no place for these tables: {begin} ... <!-- end -->")
+    blocks = "\n\n".join(f"{title}\n{text_table(lines)}" for title, lines in tables.items())
+    block = f"{begin}\n`{command}` at `{commit}`:\n\n```\n{blocks}\n```\n<!-- end -->"
+    path.write_text(place.sub(lambda _: block, text), encoding="utf-8")
