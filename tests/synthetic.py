@@ -136,6 +136,7 @@ def _front_end(motion, rng, seq, end_ns, period_ns, m, noise, outliers):
             n.astype(f4),
             speed.astype(f4),
             sigma.astype(f4),
+            n_events=90 * m,
         ),
         DepthBatch(
             seq,
@@ -160,3 +161,29 @@ def renumber(stream, by):
     for m in stream:
         batch = {"batch_seq": m.batch_seq + by} if isinstance(m, ImuSamples) else {}
         yield replace(m, seq=m.seq + by, **batch)
+
+
+def silent(stream, from_s, to_s=float("inf")):
+    """The stream as ingest sends it where there is no left event for long: no batches at all, time alone goes on."""
+    gone, last = set(), None
+    for m in stream:
+        inside = from_s * 1e9 < m.t_ns <= to_s * 1e9
+        if isinstance(m, ImuSamples):
+            if m.batch_seq >= 0 and from_s * 1e9 < m.batch_t_ns <= to_s * 1e9:
+                gone.add(m.batch_seq)
+                m = replace(m, batch_seq=last[0], batch_t_ns=last[1])
+            elif m.batch_seq >= 0:
+                m = replace(m, batch_seq=m.batch_seq - len(gone))
+                last = (m.batch_seq, m.batch_t_ns)
+            yield m
+        elif not inside:
+            yield replace(m, seq=m.seq - len(gone))
+
+
+def with_imu(stream, change):
+    """The stream with ``change(t_s, accel, gyro) -> (accel, gyro)`` applied to its samples, (n,), (n, 3), (n, 3)."""
+    for m in stream:
+        if isinstance(m, ImuSamples) and len(m.sample_t_ns):
+            accel, gyro = change(m.sample_t_ns * 1e-9, m.accel.copy(), m.gyro.copy())
+            m = replace(m, accel=accel, gyro=gyro)
+        yield m

@@ -125,6 +125,7 @@ class FlowBatch:
     batch_seq: int = -1  # of the DepthBatch at the same events; -1: seq itself
     first: int = 0  # what to add to index for the position there
     t_start_ns: int = -1  # start of the batch, -1: not known
+    n_events: int = -1  # left events in the batch before selection, -1: not known
 
 
 @dataclass(frozen=True, slots=True)

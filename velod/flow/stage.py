@@ -50,7 +50,7 @@ class FlowStage:
             self.counters[f"flow.{cause}"] += count
         index, flow = index[:n], flow[:n]
         x, y, nx_ny, speed, sigma = (np.ascontiguousarray(flow[:, k]) for k in (0, 1, slice(2, 4), 4, 5))
-        batch = (m.batch_seq, m.first, m.t_start_ns)
+        batch = (m.batch_seq, m.first, m.t_start_ns, m.n_events)
         return [FlowBatch(m.seq, m.t_ns, size, index, m.age[index], x, y, nx_ny, speed, sigma, *batch)]
 
     def _well_formed(self, m: EventBatch) -> bool:

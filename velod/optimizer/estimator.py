@@ -13,12 +13,13 @@ from velod.geometry.rectify import rectify
 from velod.geometry.so3 import hat, log
 from velod.optimizer import attitude, flow_equation, inertial_residual
 from velod.optimizer.attitude import Attitude
+from velod.optimizer.consistency import Consistency
 from velod.optimizer.flow_equation import BIN_NS, Bins, Fit, Measured, Rows
 from velod.optimizer.inertial import InertialMemory
 from velod.optimizer.interval import Interval
 from velod.optimizer.preintegration import Preintegration, preintegrate
 from velod.optimizer.spline import locate
-from velod.optimizer.standstill import QUIET_NS, Standstill
+from velod.optimizer.standstill import QUIET_EVENTS, QUIET_NS, Standstill
 from velod.optimizer.window import Window
 from velod.types import F64, I64, NS_PER_S, DepthBatch, FlowBatch, ImuSamples
 
@@ -28,8 +29,14 @@ SMOOTHNESS = {"error": 0.5, "velocity": 5.0}
 """Weak sigma of the second difference of control points, m/s, by what the spline models."""
 INNOVATION_GATE = 25.0
 """Squared Mahalanobis distance from which a batch that contradicts the prediction loses weight (5 sigma)."""
-STANDSTILL_SIGMA = 0.05
-"""m/s, of a velocity observed as zero at the end of one batch."""
+RESTING_SIGMA = 0.002
+"""m/s, of what may have begun since rest was observed last and the IMU does not show."""
+BIAS_TRIAL_NS, BIAS_TRIAL_SIGMAS = 2_000_000_000, 3.0
+"""A bias that is found so large so soon was not drawn with its specified sigma ..."""
+BIAS_MARGIN = 10.0
+"""... which is then taken this many times: always, it would cost a third of the accuracy."""
+USUAL_DEPTH = 3.0
+"""m, before any was seen."""
 MAX_INTEGRATED = 1000.0
 """m/s; s_L, which gravity makes grow without end, is counted anew beyond this."""
 ACCELERATION_NS = 15_000_000
@@ -86,49 +93,82 @@ class Estimator:
         self.counters: dict[str, int] = {}
         self.memory = InertialMemory(o.window_s + 3.0)
         self._segments = int(np.ceil(o.window_s / o.knot_s)) + 1
-        self._standstill = Standstill(settings.imu)
+        self._bias_margin = 1.0
+        self.consistency = Consistency()
+        self._standstill = Standstill(settings.imu, calibration.left.width * calibration.left.height)
         self._forget()
 
     def _forget(self) -> None:
         """Nothing is known of the velocity."""
         o = self._o
         common_sigma = np.array([o.flow_scale_sigma, o.delay_sigma_ms * 1e-3, o.depth_scale_sigma])
-        self.window = Window(self._imu, self._knot_ns, self._segments, SMOOTHNESS[o.spline], common_sigma)
+        self.window = Window(
+            self._imu, self._knot_ns, self._segments, SMOOTHNESS[o.spline], common_sigma, self._bias_margin
+        )
         self.head: Head | None = None
         self.batches = 0  # that gave a velocity
         self.last_usable_t_ns = 0
         self.own_solution: tuple[int, F64, F64] | None = None  # end of the newest batch with one, s_L there, its e
         self._open: list[Interval] = []  # that may get flows yet; the last one is incomplete
+        self._started_ns = 0
+        self._depth_m = USUAL_DEPTH  # median of the newest batch
+        self._still_to = 0  # up to here rest has been observed
+        self.lacking = "no events"  # why the newest batch gave no velocity
         # t_ns -> the IMU up to there and the prediction, from the head ``_carried_from``
         self._carried: dict[int, tuple[Preintegration, F64, F64]] = {}
         self._carried_from: Head | None = None
 
     def add_imu(self, samples: ImuSamples) -> None:
-        """Remember IMU samples."""
-        self.memory.append(samples.sample_t_ns, samples.accel, samples.gyro)
+        """Remember IMU samples, later than all before."""
+        if spikes := self.memory.append(samples.sample_t_ns, samples.accel, samples.gyro):
+            self._count("imu.spike", spikes)
 
     def absorb(self, flow: FlowBatch, depth: DepthBatch) -> None:
         """Take a batch in; the IMU must cover its end. A batch older than the head adds what it knows."""
         self.memory.integrate_to(flow.t_ns, *self._biases())
-        if not self.window.empty and not self.memory.covers(self._open[-1].t_i, flow.t_ns):
-            self._count("estimate.restart_after_hole")
-            self._forget()
+        self._start_anew_where_it_is_wrong(flow.t_ns)
         equations = self._equations(flow, depth)
-        still = self._o.zero_velocity and self._standstill.detected(flow, self.memory, self._biases()[1])
+        late = self.head is not None and flow.t_ns <= self.head.t_ns
+        predicted = None if late or self.head is None else self.predict(flow.t_ns)
+        still = (
+            not late
+            and self._o.zero_velocity
+            and self._standstill.detected(flow, self.memory, self._biases()[1], predicted)
+        )
         if self.window.empty:
             if equations is None and not still:
                 return
             self._start(flow.t_ns - QUIET_NS if equations is None else int(equations.on_error.t_ns.min()))
-        late = self.head is not None and flow.t_ns <= self.head.t_ns
-        predicted = None if late or self.head is None else self.predict(flow.t_ns)
         if not late:
             self._extend_to(flow.t_ns)
         if equations is not None:
             self._add_flow(flow.t_ns, equations, predicted)
-        elif still and not late:
+        elif still:
             self._add_standstill(flow.t_ns)
         self._solve_head(self.head.t_ns if late and self.head is not None else flow.t_ns)
         self._keep_error_small()
+
+    def _start_anew_where_it_is_wrong(self, t_ns: int) -> None:
+        """Forget an estimate that no further batch can save."""
+        if not self.window.empty and not self.memory.covers(self._open[-1].t_i, t_ns):
+            self._count("estimate.restart_after_hole")
+            self._forget()
+        elif self.consistency.hopeless:
+            self._count("estimate.restart_on_disagreement")
+            self.consistency.start_anew()
+            self._forget()
+        elif self._bias_margin == 1.0 and self._biases_exceed_specification():
+            self._count("bias.beyond_specification")
+            self._bias_margin = BIAS_MARGIN
+            self._forget()
+
+    def _biases_exceed_specification(self) -> bool:
+        """Whether they were not drawn with the sigmas of the settings; later on they may have walked."""
+        head = self.head
+        if head is None or head.t_ns - self._started_ns > BIAS_TRIAL_NS:
+            return False
+        accel, gyro = np.abs(head.b_a) / self._imu.accel_bias_sigma, np.abs(head.b_w) / self._imu.gyro_bias_sigma
+        return bool(max(accel.max(), gyro.max()) > BIAS_TRIAL_SIGMAS)
 
     def predict(self, t_ns: int) -> tuple[F64, F64] | None:
         """v_B (3,) and its covariance (3, 3) at ``t_ns``, carried there from the head by the IMU (Eq. 10)."""
@@ -137,6 +177,21 @@ class Estimator:
             return None
         _, v, cov = self._carry(head, t_ns)
         return v.copy(), cov.copy()
+
+    def output(self, t_ns: int) -> tuple[F64, F64] | None:
+        """``predict`` with the covariance that is due where flow and IMU disagree.
+
+        And rest, where there was rest at the head and the IMU has been quiet since.
+        """
+        predicted = self.predict(t_ns)
+        if predicted is None:
+            return None
+        v, cov = predicted[0], predicted[1] * self.consistency.factor
+        if not self._standstill.goes_on(self.memory, t_ns, self._biases()[1]):
+            return v, cov
+        sigma = max(self._still_sigma(), RESTING_SIGMA)
+        gain = cov @ np.linalg.inv(cov + np.eye(3) * sigma**2)
+        return v - gain @ v, cov - gain @ cov
 
     def attitude(self, t_ns: int) -> Attitude | None:
         """Which way is up at ``t_ns``, carried there from the head by the gyroscope; None while that is unknown."""
@@ -156,11 +211,16 @@ class Estimator:
             self._carried[t_ns] = (p, *inertial_residual.carry(p, head.v_B, head.R_LB, head.g_L, head.cov))
         return self._carried[t_ns]
 
+    @property
+    def dark(self) -> bool:
+        """Whether the sensor moves and sees nothing."""
+        return self._standstill.dark
+
     def _biases(self) -> tuple[F64, F64]:
         return (np.zeros(3), np.zeros(3)) if self.head is None else (self.head.b_a, self.head.b_w)
 
-    def _count(self, name: str) -> None:
-        self.counters[name] = self.counters.get(name, 0) + 1
+    def _count(self, name: str, by: int = 1) -> None:
+        self.counters[name] = self.counters.get(name, 0) + by
 
     def _preintegrate(
         self, t_i: int, t_j: int, b_a: F64, b_w: F64, gyro_noise: float | None = None
@@ -205,8 +265,10 @@ class Estimator:
         at_flow, at_depth, t = at_flow[inside], at_depth[inside], t[inside]
         if len(t) < self._o.min_flows:
             self._count("fit.few_flows")
+            self.lacking = _lack(flow, depth)
             return None
         inv_depth = depth.inv_depth[at_depth]
+        self._depth_m = 1.0 / max(float(np.median(inv_depth)), 1e-3)
         a_B, b_B = flow_equation.body_rows(
             (flow.x[at_flow], flow.y[at_flow]), flow.n[at_flow], inv_depth, self._camera, self._R_CB, self._p_BC_B
         )
@@ -246,6 +308,7 @@ class Estimator:
     def _start(self, t_ns: int) -> None:
         self.window.start(t_ns)
         self._open = [self._interval_from(t_ns)]
+        self._started_ns = t_ns
 
     def _extend_to(self, t_ns: int) -> None:
         """Open segments and add the inertial factors of the complete preintegration intervals up to ``t_ns``."""
@@ -299,11 +362,14 @@ class Estimator:
         fit = self._fit(t_ns, equations)
         if fit is None:
             self._count("fit.undetermined")
+            self.lacking = "the flows do not determine a velocity"
             return
         self.own_solution = (t_ns, self.memory.at(np.array([t_ns]))[1][0], fit.e)
         shared = self._o.shared_error
         if predicted is not None:
-            shared *= max(1.0, self._innovation(t_ns, fit, predicted) / INNOVATION_GATE)
+            innovation = self._innovation(t_ns, fit, predicted)
+            self.consistency.note(innovation)
+            shared *= max(1.0, innovation / INNOVATION_GATE)
         if shared > self._o.shared_error:
             self._count("fit.inconsistent")
         rows, common = equations.on_spline, equations.common
@@ -322,12 +388,23 @@ class Estimator:
             self.window.add_interval(alone)
 
     def _add_standstill(self, t_ns: int) -> None:
-        """v_B = 0 at ``t_ns``, as an observation."""
+        """v_B = 0 at ``t_ns`` and w_B = 0 since the observation before, as observations."""
         _, N, M = self._frame(t_ns)
-        self.window.add(M @ self.window.spline_row(t_ns), -N, np.eye(3) / STANDSTILL_SIGMA**2)
+        self.window.add(M @ self.window.spline_row(t_ns), -N, np.eye(3) / self._still_sigma() ** 2)
+        since_ns = max(self._still_to, t_ns - QUIET_NS)
+        gyro = self.memory.gyro[self.memory.between(since_ns, t_ns)]
+        if len(gyro):
+            # what the gyroscope says is its bias, and noise of the density over the root of the time
+            information = (t_ns - since_ns) * 1e-9 / self._imu.gyro_noise**2
+            J = self.window.selector(t_ns)[6:9]
+            self.window.add(J, gyro.mean(axis=0), np.eye(3) * information)
+        self._still_to = t_ns
         self._count("standstill")
         self.batches += 1
         self.last_usable_t_ns = t_ns
+
+    def _still_sigma(self) -> float:
+        return self._standstill.sigma(self._depth_m / self._camera[0])
 
     def _innovation(self, t_ns: int, fit: Fit, predicted: tuple[F64, F64]) -> float:
         """Squared Mahalanobis distance of the batch's own velocity from the predicted one."""
@@ -362,3 +439,12 @@ class Estimator:
         cov = T @ solution.cov(F) @ T.T
         common = solution.x[self.window.common_columns(locate(t_ns, self._knot_ns)[0])]
         self.head = Head(t_ns, N + M @ x[:3], x[3:6], x[6:9], x[9:12], R_LB, cov, common)
+
+
+def _lack(flow: FlowBatch, depth: DepthBatch) -> str:
+    """What there is too little of in a batch."""
+    if flow.n_selected < QUIET_EVENTS:
+        return "no events"
+    if len(flow.index) <= len(depth.index):
+        return f"{len(flow.index)} flows of {flow.n_selected} events"
+    return f"{len(depth.index)} depths of {flow.n_selected} events"

@@ -12,6 +12,7 @@ import numpy as np
 from numba import njit
 
 from velod.geometry.so3 import exp_so3
+from velod.optimizer.spikes import ACCEL_SPIKE, GYRO_SPIKE, mend_spikes
 from velod.types import F64, I64
 
 
@@ -49,8 +50,13 @@ class InertialMemory:
         """Whether there are samples at or before ``t_i`` and at or after ``t_j``."""
         return self._n >= 2 and self._t[0] <= t_i and self._t[self._n - 1] >= t_j
 
-    def append(self, t_ns: I64, accel: F64, gyro: F64) -> None:
-        """Add samples, later than all before; forget what is older than the memory."""
+    def between(self, start_ns: int, end_ns: int) -> slice:
+        """The samples with start_ns <= t < end_ns."""
+        start, end = np.searchsorted(self.t_ns, (start_ns, end_ns))
+        return slice(int(start), int(end))
+
+    def append(self, t_ns: I64, accel: F64, gyro: F64) -> int:
+        """Add samples, later than all before; forget what is older than the memory. Returns how many were mended."""
         m = len(t_ns)
         if self._n + m > len(self._t):
             self._forget()
@@ -62,6 +68,9 @@ class InertialMemory:
             self._R[0], self._s[0] = np.eye(3), 0.0
             self._n_integrated = 1
         self._n += m
+        # what has been integrated stays; the newest sample has no successor yet to be judged by
+        span = (max(self._n - m - 1, self._n_integrated), self._n - 1)
+        return mend_spikes(self.accel, ACCEL_SPIKE, *span) + mend_spikes(self.gyro, GYRO_SPIKE, *span)
 
     def integrate_to(self, t_ns: int, b_a: F64, b_w: F64) -> None:
         """Extend R_LB and s_L to the first sample at or after ``t_ns``, with these biases."""

@@ -60,9 +60,11 @@ class Parts:
         ages = [np.minimum(p.age.astype(np.int64) + (depth.t_ns - p.t_ns), _MAX_AGE_NS) for p in parts]
         x, y, n, speed, sigma = (np.concatenate([getattr(p, name) for p in parts]) for name in _COLUMNS)
         index, age = np.concatenate([p.index + np.uint16(p.first) for p in parts]), np.concatenate(ages)
+        counts = [p.n_events for p in parts]
+        n_events = sum(counts) if min(counts) >= 0 else -1
         return FlowBatch(
             depth.seq, depth.t_ns, depth.n_selected, index, age.astype(np.uint32), x, y, n, speed, sigma,
-            depth.seq, 0, depth.t_start_ns,
+            depth.seq, 0, depth.t_start_ns, n_events,
         )  # fmt: skip
 
 

@@ -8,6 +8,7 @@ stays away for longer than ``max_wait_ms`` of sensor time is a velocity made wit
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -32,8 +33,8 @@ DEGRADED_AFTER_NS = 100_000_000
 """Without usable flow for so long the estimate runs on the IMU alone."""
 CLOCK_RESTART_NS = 10 * NS_PER_S
 """Events this far back in time mean that the sensor's clock was set anew."""
-IMU_GAP_NS = NS_PER_S
-"""A longer hole in the IMU cannot be bridged: start anew."""
+IMU_GAP_NS = NS_PER_S // 10
+"""A longer hole in the IMU cannot be bridged, for nobody knows how the sensor turned: start anew."""
 
 
 class OptimizerStage:
@@ -44,6 +45,8 @@ class OptimizerStage:
         self._hz = settings.optimizer.output_hz
         wait = settings.optimizer.max_wait_ms
         self._max_wait_ns = int(wait * 1e6) if np.isfinite(wait) else None
+        ingest = settings.ingest
+        self._silence_ns = None if ingest.batch == "count" else round(ingest.period_ms * 1e6)
         self.counters: dict[str, int] = {}
         self._check = CalibrationCheck(settings.optimizer)
         self.alarms, self.gauges = self._check.alarms, self._check.gauges
@@ -64,8 +67,9 @@ class OptimizerStage:
         self._event_t_ns = 0
         self._now_ns = 0  # newest sensor time heard of
         self._tick = -1  # number of the next velocity on the grid of the output rate
-        self._was_valid = False
+        self._was_valid = self._was_lost = False
         self._newest = (-1, 0)  # seq and t_ns of the newest batch taken in
+        self._silent_to = 0  # without an event since the newest batch
 
     def handle(self, message: FlowBatch | DepthBatch | ImuSamples) -> list[Velocity | Odometry]:
         """Take one message; return the velocities that it completes, a valid one with its dead reckoning.
@@ -124,19 +128,23 @@ class OptimizerStage:
             self._count("imu.backwards", int((~new).sum()))
         if not new.any():
             return
-        t = m.sample_t_ns[new]
-        if self._imu_t_ns >= 0 and t[0] - self._imu_t_ns > IMU_GAP_NS:
-            self._count("imu.gap_restart")
-            self._restart_after_gap()
-        self._estimator.memory.append(t, m.accel[new], m.gyro[new])
+        t, accel, gyro = m.sample_t_ns[new], m.accel[new], m.gyro[new]
+        before = t[0] if self._imu_t_ns < 0 else self._imu_t_ns
+        holes = np.flatnonzero(np.diff(t, prepend=before) > IMU_GAP_NS).tolist()
+        for first, end in pairwise(sorted({0, *holes, len(t)})):
+            if first in holes:
+                self._count("imu.gap_restart")
+                self._restart_after_gap()
+            part = slice(first, end)
+            self._estimator.add_imu(replace(m, sample_t_ns=t[part], accel=accel[part], gyro=gyro[part]))
+            if self._tick < 0 and end > first:
+                self._tick = self._tick_after(int(t[first]) - 1)
         self._imu_t_ns = int(t[-1])
-        if self._tick < 0:
-            self._tick = self._tick_after(int(t[0]) - 1)
 
     def _restart_after_gap(self) -> None:
         self._estimator = Estimator(self._settings, self._calibration)
         self._estimator.counters = self.counters
-        self._was_valid = False
+        self._was_valid, self._was_lost = False, self._was_valid or self._was_lost
         self._tick = -1
 
     def _tick_ns(self, k: int) -> int:
@@ -161,6 +169,8 @@ class OptimizerStage:
                     break
                 self._count("velocity.without_batch")
                 self._take_out_of_order(tau)
+            else:
+                self._take_in_silence(tau)
             out += self._put_out(tau)
             self._tick += 1
         return out
@@ -183,6 +193,18 @@ class OptimizerStage:
             else:
                 return self._event_t_ns >= tau
         return False
+
+    def _take_in_silence(self, tau: int) -> None:
+        """An empty batch where there has certainly been no left event, which ingest makes no batches of for ever.
+
+        An event opens a batch, and a batch ends within a period: all those that ended by ``tau`` have been taken in.
+        """
+        if self._silence_ns is None or self._newest[1] == 0:
+            return
+        t_ns = tau - self._silence_ns
+        if t_ns >= max(self._newest[1], self._silent_to) + self._silence_ns:
+            self._estimator.absorb(*nothing(t_ns))
+            self._silent_to = t_ns
 
     def _take_out_of_order(self, tau: int) -> None:
         """Take in whatever is complete, and give up what is about to leave the window."""
@@ -242,7 +264,7 @@ class OptimizerStage:
         return [velocity, replace(odometry, age_ms=velocity.age_ms)]
 
     def _velocity(self, tau: int, attitude: Attitude | None) -> Velocity:
-        predicted = self._estimator.predict(tau)
+        predicted = self._estimator.output(tau)
         if predicted is None:
             v, cov = np.zeros(3), np.eye(3) * UNKNOWN_SIGMA**2
         else:
@@ -258,16 +280,42 @@ class OptimizerStage:
         """State, reason and validity of an estimate."""
         sigma = float(np.sqrt(np.linalg.eigvalsh(cov)[-1]))
         limit = VALID_SIGMA + VALID_SHARE * float(np.linalg.norm(v))
+        disagreement = self._estimator.consistency.disagreement
+        if self._estimator.consistency.on_probation:
+            self._was_valid, self._was_lost = False, True
+            return TrackingState.LOST, disagreement, False
         if not self._was_valid:
+            state = TrackingState.LOST if self._was_lost else TrackingState.INITIALISING
             if self._estimator.batches < MIN_BATCHES:
-                return TrackingState.INITIALISING, f"{self._estimator.batches} usable batches", False
+                return state, f"{self._estimator.batches} usable batches", False
             if sigma > limit:
-                return TrackingState.INITIALISING, f"sigma {sigma:.2f} m/s", False
-            self._was_valid = True
+                return state, self._uncertain(tau, sigma), False
+            self._was_valid, self._was_lost = True, False
         if sigma > LOST_FACTOR * limit:
-            self._was_valid = False
-            return TrackingState.LOST, f"sigma {sigma:.2f} m/s", False
-        alone_ns = tau - self._estimator.last_usable_t_ns
-        if alone_ns > DEGRADED_AFTER_NS:
-            return TrackingState.DEGRADED, f"no flow for {alone_ns * 1e-6:.0f} ms", True
+            self._was_valid, self._was_lost = False, True
+            return TrackingState.LOST, self._uncertain(tau, sigma), False
+        if without_flow := self._without_flow(tau):
+            return TrackingState.DEGRADED, without_flow, True
+        if disagreement:
+            return TrackingState.DEGRADED, disagreement, True
         return TrackingState.TRACKING, "", True
+
+    def _uncertain(self, tau: int, sigma: float) -> str:
+        return "; ".join(filter(None, (f"sigma {sigma:.2f} m/s", self._without_flow(tau))))
+
+    def _without_flow(self, tau: int) -> str:
+        """For how long there has been none, and why; empty where there is flow."""
+        alone_ns = tau - self._estimator.last_usable_t_ns
+        if alone_ns <= DEGRADED_AFTER_NS or self._estimator.batches == 0:
+            return ""
+        why = "dark or covered" if self._estimator.dark else self._estimator.lacking
+        return f"no flow for {alone_ns * 1e-6:.0f} ms: {why}"
+
+
+def nothing(t_ns: int) -> tuple[FlowBatch, DepthBatch]:
+    """A batch that ended at ``t_ns`` without an event."""
+    u2, f4, rows = np.empty(0, np.uint16), np.empty(0, np.float32), np.empty((0, 2), np.float32)
+    return (
+        FlowBatch(-1, t_ns, 0, u2, np.empty(0, np.uint32), f4, f4, rows, f4, f4, n_events=0),
+        DepthBatch(-1, t_ns, 0, u2, f4, f4, f4, np.empty(0, np.uint8)),
+    )

@@ -52,11 +52,20 @@ class Solution:
 class Window:
     """Information over the segments ``first`` .. ``last``."""
 
-    def __init__(self, imu: ImuSettings, knot_ns: int, segments: int, smoothness: float, common_sigma: F64) -> None:
+    def __init__(
+        self,
+        imu: ImuSettings,
+        knot_ns: int,
+        segments: int,
+        smoothness: float,
+        common_sigma: F64,
+        bias_margin: float = 1.0,
+    ) -> None:
         """``smoothness``: sigma of the second difference of control points, m/s; weak, so that none is free.
 
-        ``common_sigma`` (3,): of the common errors of the flows.
+        ``common_sigma`` (3,): of the common errors of the flows; ``bias_margin`` is on the biases' sigmas at start.
         """
+        self._bias_margin = bias_margin
         self._common_sigma = common_sigma
         self._imu = imu
         self._noise_information = BIN_NS * 1e-9 / imu.gyro_noise**2
@@ -94,7 +103,7 @@ class Window:
         at = np.arange(HEAD)
         self._H[at, at] = 1.0 / UNKNOWN_VELOCITY**2
         b = self.bias_columns(self.last)
-        sigma = np.repeat([self._imu.accel_bias_sigma, self._imu.gyro_bias_sigma], 3)
+        sigma = self._bias_margin * np.repeat([self._imu.accel_bias_sigma, self._imu.gyro_bias_sigma], 3)
         self._H[b, b] = 1.0 / sigma**2
         g = self.gravity_columns(self.last)
         self._H[g, g] = 1.0 / self._imu.gravity**2
