@@ -144,7 +144,7 @@ class DepthSettings:
     )
     sigma_zncc_px: float = _f(0.35, "disparity sigma of block matching alone, px", above=0.0, hi=10.0)
     sigma_refined_px: float = _f(
-        0.05, "disparity sigma of a refined match at a vertical edge, px", above=0.0, hi=10.0
+        0.01, "share of a refined match's disparity sigma that no residual shows, px", above=0.0, hi=10.0
     )
 
 

@@ -31,6 +31,10 @@ F64 = NDArray[np.float64]
 NS_PER_S = 1_000_000_000
 PATCH = 5
 """Side of the neighbourhood of the plane fit, in pixels (Sec. V-A: 5 x 5)."""
+WIDE = 7
+"""Side of the neighbourhood that a fitted plane is widened to, in pixels."""
+RING = WIDE * WIDE - PATCH * PATCH
+"""Neighbours of the 7x7 around the 5x5."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +89,8 @@ class EventBatch:
     patch: U32  # (n, 25) ages (ns) of the 5x5 same-polarity neighbours, row-major, 0 = none
     batch_seq: int = -1  # of the StereoBatch that carries the same events; -1: seq itself
     first: int = 0  # position there of the first event
+    ring: U32 = field(default_factory=lambda: np.empty((0, RING), np.uint32))
+    """(n, 24) likewise the rest of the 7x7, row-major without the 5x5; (0, 24): not known, or not wanted"""
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,9 @@ import pytest
 
 from tests.moving_edge import PLAIN, PLAIN_RIG, Edge, batch, without_right
 from velod.config import DepthSettings, Settings
+from velod.depth.refine import INFLATION
 from velod.depth.stage import DepthStage
+from velod.events.plane_fit import USUAL_RMS_PX, USUAL_WEIGHT
 from velod.geometry import so3
 from velod.geometry.calibration import Calibration, Camera
 from velod.types import DepthBatch, StereoBatch
@@ -44,9 +46,11 @@ def test_inverse_depth_and_its_sigma_are_disparities_over_f_b() -> None:
     out, _ = run(batch(Edge()))
     f_b = 200.0 * 0.1
     np.testing.assert_allclose(out.inv_depth, out.disparity / f_b, rtol=1e-6)
-    # An edge without jitter: the least sigma, 0.3 of the setting, at the angle's cosine.
+    # An edge without jitter on two planes of 49 neighbours: what is usual of their residuals, at the angle's cosine.
+    of_neighbour_px = INFLATION * USUAL_RMS_PX * np.sqrt(USUAL_WEIGHT / (46 + USUAL_WEIGHT))
+    of_planes_px = np.sqrt(2 / 49) * of_neighbour_px / np.cos(0.2)
     refined = out.refined == 1
-    np.testing.assert_allclose(out.sigma[refined] * f_b, 0.3 * 0.05 / np.cos(0.2), rtol=0.05)
+    np.testing.assert_allclose(np.median(out.sigma[refined]) * f_b, np.hypot(of_planes_px, 0.01), rtol=0.02)
 
 
 def test_the_sigma_of_refined_matches_is_honest_under_jitter() -> None:

@@ -10,11 +10,15 @@ import pytest
 
 from tests.moving_edges import FOCAL, HEIGHT, WIDTH, calibration
 from velod.config import Settings, from_tree
+from velod.events.plane_fit import fit_plane, honest_rms, widen_plane
+from velod.flow.kernel import BEND_PX, INFLATION
 from velod.flow.stage import FlowStage
 from velod.geometry.camera import undistort
 from velod.types import EventBatch, FlowBatch
 
 DX, DY = (a.ravel() for a in np.meshgrid(np.arange(-2, 3), np.arange(-2, 3)))
+WIDE_DX, WIDE_DY = (a.ravel() for a in np.meshgrid(np.arange(-3, 4), np.arange(-3, 4)))
+CORE = (np.abs(WIDE_DX) <= 2) & (np.abs(WIDE_DY) <= 2)
 T_NS = 2_000_000_000
 EVENT_AGE_NS = 30_000_000
 
@@ -30,6 +34,17 @@ def batch(
     n = len(patch)
     at = [np.broadcast_to(np.asarray(v, np.uint16), n).copy() for v in (x, y)]
     return EventBatch(7, T_NS, T_NS - 10_000_000, 500, *at, patch[:, 12].copy(), np.ones(n, np.uint8), patch)
+
+
+def wide_batch(speed: np.ndarray, angle: np.ndarray, x: np.ndarray, y: np.ndarray, noise_px: float) -> EventBatch:
+    """As ``batch``, with the ring around the patches."""
+    along = np.cos(angle)[:, None] * WIDE_DX + np.sin(angle)[:, None] * WIDE_DY
+    along = along + np.random.default_rng(2).normal(0, noise_px, along.shape)
+    ages = np.round(EVENT_AGE_NS - along / speed[:, None] * 1e9).astype(np.uint32)
+    core = np.ascontiguousarray(ages[:, CORE])
+    return replace(
+        batch(speed, angle, x, y), patch=core, age=core[:, 12].copy(), ring=np.ascontiguousarray(ages[:, ~CORE])
+    )
 
 
 def flows(message: EventBatch, stage: FlowStage | None = None, **flow: object) -> FlowBatch:
@@ -94,7 +109,62 @@ def test_sigma_is_the_scatter_of_noisy_fits() -> None:
     out = flows(batch(np.full(n, 300.0), rng.uniform(-math.pi, math.pi, n), noise_px=0.15))
     z = (out.speed - 300.0) / out.sigma
     assert 0.5 < z.std() < 1.2
+    # A residual far below the usual is luck.
     assert out.sigma.min() > 0.006 * 300.0
+
+
+def across_motion(seed: int, n: int = 400) -> tuple[EventBatch, np.ndarray]:
+    """Edges of all directions in an image that turns and grows; the batch and the motion (n, 2) at its events."""
+    rng = np.random.default_rng(seed)
+    x, y = rng.integers(5, WIDTH - 5, n), rng.integers(5, HEIGHT - 5, n)
+    u = np.column_stack([300.0 - 4.0 * (y - 20) + 2.0 * (x - 30), 100.0 + 4.0 * (x - 30) + 2.0 * (y - 20)])
+    angle = np.arctan2(u[:, 1], u[:, 0]) + rng.uniform(-1.3, 1.3, n)
+    return wide_batch((u * np.column_stack([np.cos(angle), np.sin(angle)])).sum(axis=1), angle, x, y, 0.15), u
+
+
+def test_the_ring_halves_the_scatter_of_flows() -> None:
+    n = 2000
+    message = wide_batch(np.full(n, 300.0), np.linspace(-3, 3, n), np.full(n, 30), np.full(n, 20), 0.15)
+    wide, narrow = flows(message), flows(replace(message, ring=message.ring[:0]))
+    assert len(wide.speed) == len(narrow.speed) == n
+    assert wide.speed.std() < 0.6 * narrow.speed.std()
+
+
+def test_sigma_is_honest_for_edges_at_all_angles_to_the_motion() -> None:
+    message, u = across_motion(4)
+    out = flows(message)
+    true = (u[out.index] * out.n).sum(axis=1)
+    along = np.abs((u[out.index] * out.n[:, ::-1] * [-1.0, 1.0]).sum(axis=1)) / true
+    z = (out.speed - true) / out.sigma
+    for steep in (along < 0.4, (along >= 0.4) & (along < 1.2), along >= 1.2):
+        assert steep.sum() > 60
+        # White residuals, and sigmas for those of real edges, which neighbours share.
+        assert 0.6 < z[steep].std() < 1.0
+
+
+def test_sigmas_agree_with_their_numpy_twin() -> None:
+    message, _ = across_motion(5, 120)
+    out = flows(message)
+    x, y = message.x[out.index].astype(float), message.y[out.index].astype(float)
+    nx, ny = out.n[:, 0].astype(float), out.n[:, 1].astype(float)
+    cx, cy = (x - x.mean()) / 100.0, (y - y.mean()) / 100.0
+    a = np.column_stack([nx, ny, nx * cx, ny * cx, nx * cy, ny * cy])
+    b = out.speed.astype(float)
+    u = np.linalg.solve(a.T @ a + np.eye(6), a.T @ b)
+    ux, uy = u[0] + u[2] * cx + u[4] * cy, u[1] + u[3] * cx + u[5] * cy
+    unknown = np.mean((b - a @ u) ** 2) + 6 * np.mean(b**2) / len(b)
+    for k, i in enumerate(out.index):
+        age = np.empty(49)
+        age[CORE], age[~CORE] = message.patch[i] * 1e-9, message.ring[i] * 1e-9
+        fit, bend = widen_plane(fit_plane(age[CORE], 1.0, 2, 20), age, 1.0, 0.35)
+        n, gx, gy, _, rms, qxx, qxy, qyy = fit
+        q, normal = np.array([[qxx, qxy], [qxy, qyy]]), np.array([gx, gy]) / np.hypot(gx, gy)
+        edge = np.array([-normal[1], normal[0]])
+        share = INFLATION * honest_rms(n, rms, np.hypot(gx, gy)) / np.hypot(gx, gy)
+        along, turn = (share * np.sqrt(v @ q @ v) for v in (normal, edge))
+        along = np.hypot(along, BEND_PX * bend / np.hypot(gx, gy))
+        expected = np.sqrt((b[k] * along) ** 2 + turn**2 * ((edge @ [ux[k], uy[k]]) ** 2 + unknown))
+        assert out.sigma[k] == pytest.approx(expected, rel=1e-4)
 
 
 def test_what_fits_no_plane_is_refused_by_cause() -> None:
@@ -124,6 +194,8 @@ def test_an_empty_batch_gives_an_empty_one() -> None:
         {"y": np.full(3, HEIGHT, np.uint16)},
         {"age": np.ones(2, np.uint32)},
         {"patch": np.ones((3, 24), np.uint32)},
+        {"ring": np.ones((3, 25), np.uint32)},
+        {"ring": np.ones((2, 24), np.uint32)},
     ],
 )
 def test_a_batch_that_cannot_be_read_is_counted_and_dropped(change: dict[str, np.ndarray]) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from velod.events.plane_fit import fit_plane
+from velod.events.plane_fit import fit_plane, honest_rms, widen_plane
 
 DX, DY = (a.ravel() for a in np.meshgrid(np.arange(-2, 3), np.arange(-2, 3)))
 
@@ -86,3 +86,85 @@ def test_the_kernel_agrees_with_its_numpy_twin(seed: int) -> None:
     got = fit_plane(age, 1.0, 2, 6)
     assert got == pytest.approx(twin(age, 1.0, 2, 6), rel=1e-9, abs=1e-15)
     assert got[0] >= 6
+
+
+WIDE_DX, WIDE_DY = (a.ravel() for a in np.meshgrid(np.arange(-3, 4), np.arange(-3, 4)))
+CORE = (np.abs(WIDE_DX) <= 2) & (np.abs(WIDE_DY) <= 2)
+
+
+def noisy_wide_ages(seed: int, noise_px: float = 0.15, slope: float = 2e-3) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    angle = rng.uniform(0, 2 * np.pi)
+    along = np.cos(angle) * WIDE_DX + np.sin(angle) * WIDE_DY
+    return 0.05 - slope * (along + rng.normal(0, noise_px, 49))
+
+
+def widened_twin(fit: tuple[float, ...], age: np.ndarray, reject_px: float) -> tuple[float, ...]:
+    """The same plane by numpy's least squares on what lies near the first one."""
+    a = np.column_stack([WIDE_DX, WIDE_DY, np.ones(49)])
+    near = (age > 0) & (np.abs(-age - a @ np.array(fit[1:4])) <= reject_px * np.hypot(fit[1], fit[2]))
+    gx, gy, t0 = np.linalg.lstsq(a[near], -age[near], rcond=None)[0]
+    residual = -age[near] - a[near] @ [gx, gy, t0]
+    centred = a[near, :2] - a[near, :2].mean(axis=0)
+    q = np.linalg.inv(centred.T @ centred)
+    return (near.sum(), gx, gy, t0, np.sqrt(np.mean(residual**2)), q[0, 0], q[0, 1], q[1, 1])
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_the_widened_plane_agrees_with_its_numpy_twin(seed: int) -> None:
+    age = noisy_wide_ages(seed)
+    rng = np.random.default_rng(seed)
+    age[~CORE & (rng.random(49) < 0.2)] = 0.0
+    age[~CORE & (rng.random(49) < 0.2)] += 0.02
+    fit = fit_plane(age[CORE], 1.0, 2, 20)
+    got, _ = widen_plane(fit, age, 1.0, 0.35)
+    assert got == pytest.approx(widened_twin(fit, age, 1.0), rel=1e-7, abs=1e-13)
+    assert 25 < got[0] < 49
+
+
+def test_another_edge_around_a_plane_does_no_harm() -> None:
+    age = noisy_wide_ages(1, noise_px=0.0)
+    age[WIDE_DX > 2] -= 0.02
+    got, _ = widen_plane(fit_plane(age[CORE], 1.0, 2, 20), age, 1.0, 0.35)
+    assert got[0] == 42
+    assert np.hypot(got[1], got[2]) == pytest.approx(2e-3, rel=1e-9)
+
+
+def test_what_is_no_plane_in_the_wide_stays_as_it_was_found() -> None:
+    age = noisy_wide_ages(2, noise_px=0.0)
+    rng = np.random.default_rng(2)
+    age[~CORE] += rng.choice([-1.0, 1.0], 24) * 0.9 * 2e-3
+    fit = fit_plane(age[CORE], 1.0, 2, 20)
+    assert widen_plane(fit, age, 1.0, 0.35) == (fit, 0.0)
+    assert widen_plane(fit, age, 1.0, 0.9)[0] != fit
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_bend_along_the_slope_is_told_and_one_along_the_edge_is_none(seed: int) -> None:
+    flat = noisy_wide_ages(seed, noise_px=0.0)
+    fit = fit_plane(flat[CORE], 1.0, 2, 20)
+    normal = np.array(fit[1:3]) / np.hypot(fit[1], fit[2])
+    along = normal @ [WIDE_DX, WIDE_DY]
+    across = np.array([-normal[1], normal[0]]) @ [WIDE_DX, WIDE_DY]
+    for way, told in ((along, 1.0), (across, 0.0)):
+        age = flat - 5e-5 * way**2
+        _, bend = widen_plane(fit_plane(age[CORE], 1.0, 2, 20), age, 2.0, 0.9)
+        assert bend == pytest.approx(told * 5e-5, abs=0.25 * 5e-5)
+
+
+def test_widening_halves_the_scatter_of_the_slope() -> None:
+    narrow, wide = [], []
+    for seed in range(400):
+        age = noisy_wide_ages(seed)
+        fit = fit_plane(age[CORE], 1.0, 2, 20)
+        narrow.append(np.hypot(fit[1], fit[2]))
+        wide.append(np.hypot(*widen_plane(fit, age, 1.0, 0.35)[0][1:3]))
+    # The sums of squared distances are 50 and 196 px^2.
+    assert np.std(wide) == pytest.approx(np.std(narrow) * np.sqrt(50 / 196), rel=0.15)
+
+
+def test_residuals_count_as_measured_but_for_what_is_usual() -> None:
+    slope = 2e-3
+    many, few = honest_rms(10_000, 0.3 * slope, slope), honest_rms(20, 0.01 * slope, slope)
+    assert many == pytest.approx(0.3 * slope, rel=1e-3)
+    assert few == pytest.approx(slope * np.sqrt((20 * 0.01**2 + 10 * 0.15**2) / 27), rel=1e-12)

@@ -9,7 +9,7 @@ from scipy.ndimage import map_coordinates
 from tests.moving_edge import PLAIN_RIG, Edge, batch, without_right
 from velod.depth import refine as module
 from velod.depth.refine import OUTCOMES, Refined, refine
-from velod.events.plane_fit import fit_plane
+from velod.events.plane_fit import fit_plane, widen_plane
 from velod.geometry import so3
 from velod.geometry.calibration import Calibration, Camera
 from velod.geometry.rectify import Rectification, rectify
@@ -31,9 +31,10 @@ def outcomes(result: Refined) -> set[str]:
 def plane(
     surface: np.ndarray, p: int, x: int, y: int, unit_ns: int, least: int
 ) -> tuple[int, np.ndarray, float, float]:
-    """(n, slope, time at the centre, rms) of the 5x5 patch."""
-    patch = surface[p, y - 2 : y + 3, x - 2 : x + 3].astype(np.float64).ravel() * (unit_ns / 1e9)
-    n, gx, gy, t0, rms, *_ = fit_plane(patch, 1.0, 2, least)
+    """(n, slope, time at the centre, rms) of the patch about (x, y)."""
+    patch = surface[p, y - 3 : y + 4, x - 3 : x + 4] * (unit_ns / 1e9)
+    fit = fit_plane(patch[1:6, 1:6].ravel(), 1.0, 2, least)
+    n, gx, gy, t0, rms, *_ = widen_plane(fit, patch.ravel(), 1.0, 0.35)[0] if fit[0] else fit
     return n, np.array([gx, gy]), t0, rms
 
 
@@ -98,14 +99,15 @@ def test_a_coarse_match_farther_off_is_refused(error_px: float) -> None:
     assert (result.outcome != module.REFINED).all()
 
 
-def test_the_normal_and_the_residual_are_those_of_the_edge() -> None:
+def test_the_normal_and_the_sigma_are_those_of_the_edge() -> None:
     result = refine_batch(batch(Edge(angle=0.6), jitter_s=0.15 / 300.0), rectify(PLAIN_RIG), 7.37)
     good = result.outcome == module.REFINED
     assert good.sum() > 100
     # The edge moves to larger x, so the time of passage grows that way.
     assert np.median(result.normal_x[good]) == pytest.approx(np.cos(0.6), abs=0.02)
-    # Both planes' residuals of 0.15 px, less what three parameters of 25 points take.
-    assert np.median(result.rms_px[good]) == pytest.approx(0.15 * np.sqrt(2.0 * 22 / 25), rel=0.1)
+    # Two planes of 49 neighbours with what is usual of their residuals, inflated; the scatter is that of white ones.
+    assert np.median(result.sigma_px[good]) == pytest.approx(1.1 * 0.15 * np.sqrt(2 / 49) / np.cos(0.6), rel=0.1)
+    assert np.std(result.disparity[good]) == pytest.approx(np.median(result.sigma_px[good]) / 1.1, rel=0.25)
 
 
 def test_an_edge_in_the_row_an_absent_one_and_a_missing_seed_are_told_apart() -> None:

@@ -73,11 +73,25 @@ def test_patches_hold_same_polarity_ages_in_row_order() -> None:
     surface = new_surface(8, 9)
     surface[1] = np.arange(72).reshape(8, 9)
     surface[1, 2, 3] = NEVER
-    age, patch = np.empty(1, np.uint32), np.empty((1, 25), np.uint32)
+    age, patch, ring = np.empty(1, np.uint32), np.empty((1, 25), np.uint32), np.empty((1, 24), np.uint32)
     x, y, p = np.array([4], np.uint16), np.array([3], np.uint16), np.array([1], np.uint8)
-    gather_patches(surface, x, y, p, 100, 85, age, patch)
+    gather_patches(surface, x, y, p, 100, 85, age, patch, ring)
     expected = 100 - surface[1, 1:6, 2:7].ravel()
     expected[expected > 85] = 0
     assert np.array_equal(patch[0], expected)
     assert age[0] == patch[0, 12] == 100 - (3 * 9 + 4)
     assert (patch == 0).sum() >= 2
+    around = np.ones((7, 7), bool)
+    around[1:6, 1:6] = False
+    expected = 100 - surface[1, 0:7, 1:8][around]
+    expected[expected > 85] = 0
+    assert np.array_equal(ring[0], expected)
+
+
+def test_patches_may_come_without_a_ring_nearer_to_the_edge() -> None:
+    surface = new_surface(8, 9)
+    surface[1] = np.arange(72).reshape(8, 9)
+    age, patch, ring = np.empty(1, np.uint32), np.empty((1, 25), np.uint32), np.empty((0, 24), np.uint32)
+    corner = np.array([2], np.uint16)
+    gather_patches(surface, corner, corner, np.array([1], np.uint8), 100, 200, age, patch, ring)
+    assert np.array_equal(patch[0], 100 - surface[1, :5, :5].ravel())

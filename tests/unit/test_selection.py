@@ -50,17 +50,26 @@ def one_edge(t_ms: float, speed: float = 500.0) -> tuple[np.ndarray, int]:
 
 def test_events_are_selected_once_the_edge_has_passed_their_neighbourhood() -> None:
     first, t_end = one_edge(60.1)  # the edge is at column 30
-    x, y, p = burst(first, t_end - 10 * MS, t_end, quota=500)
-    # The columns two behind those that the edge has crossed in these 10 ms.
-    assert set(x) == {24, 25, 26, 27, 28}
+    taken = new_surface(HEIGHT, WIDTH)
+    burst(first, t_end - 20 * MS, t_end - 10 * MS, taken, quota=500)
+    x, y, p = burst(first, t_end - 10 * MS, t_end, taken, quota=500)
+    # The columns three behind those that the edge has crossed in these 10 ms.
+    assert set(x) == {23, 24, 25, 26, 27}
     assert set(y) == set(range(5, HEIGHT - 5))
     assert (p == 0).all()
 
 
 def test_neighbourhoods_completed_in_an_earlier_batch_are_left_alone() -> None:
     first, t_end = one_edge(60.1)
-    x, _, _ = burst(first, t_end - 2 * MS, t_end, quota=500)
-    assert x.min() > 26
+    x, _, _ = burst(first, t_end - 2 * MS, t_end, quota=100)
+    assert x.min() > 25
+
+
+def test_what_the_quota_leaves_room_for_are_events_with_a_narrow_neighbourhood_passed_before() -> None:
+    first, t_end = one_edge(60.1)
+    first[:, 17:] = first[:, :10] = NEVER  # a strip of the edge, too short for a 7x7 about most of its rows
+    _, y, _ = burst(first, t_end - 4 * MS, t_end, quota=500)
+    assert set(y) == {12, 13, 14}  # the columns passed in these 4 ms: rows 13 = middle of 7
 
 
 def test_an_event_is_selected_once() -> None:
@@ -109,16 +118,21 @@ def test_an_empty_surface_gives_nothing() -> None:
     assert (x.dtype, y.dtype, p.dtype) == (np.uint16, np.uint16, np.uint8)
 
 
-def burst_twin(first: np.ndarray, t_start: int, t_end: int) -> set[tuple[int, int, int]]:
-    """The rule for bursts, pixel by pixel, on times that are not encoded."""
+def burst_twin(
+    first: np.ndarray, t_end: int, completed_from: int, completed_to: int, reach: int
+) -> set[tuple[int, int, int]]:
+    """The rule for bursts, pixel by pixel, on times that are not encoded, for neighbours ``reach`` px away."""
     oldest, kept = t_end - MEMORY, set()
     for p, y, x in np.argwhere((first >= t_end - MEMORY // 2) & (first < t_end)).tolist():
         if not (5 <= x < WIDTH - 5 and 5 <= y < HEIGHT - 5):
             continue
         patch = np.maximum(first[p, y - 2 : y + 3, x - 2 : x + 3].ravel(), oldest)
-        pairs = [(patch[i] - patch[12], patch[24 - i] - patch[12]) for i in (0, 2, 4, 10)]
+        outer = np.maximum(
+            first[p, y - reach : y + reach + 1 : reach, x - reach : x + reach + 1 : reach].ravel(), oldest
+        )
+        pairs = [(outer[i] - outer[4], outer[8 - i] - outer[4]) for i in range(4)]
         symmetric, antisymmetric = sum(abs(a + b) for a, b in pairs), sum(abs(a - b) for a, b in pairs)
-        completed = max(patch[[0, 2, 4, 10, 14, 20, 22, 24]]) >= t_start
+        completed = completed_from <= np.delete(outer, 4).max() < completed_to
         n, gx, gy, _, rms, *_ = fit_plane(np.where(patch > oldest, t_end - patch, 0) * 1e-9, 1.0, 2, 20)
         if completed and symmetric <= MAX_ASYMMETRY * antisymmetric and n and rms < 0.35 * np.hypot(gx, gy):
             kept.add((x, y, p))
@@ -136,10 +150,11 @@ def test_with_room_for_all_selection_is_what_its_plain_twin_says(seed: int) -> N
     first[first >= t_end] = NEVER
     x, y, p = burst(first, t_start, t_end, quota=5000)
     got = set(zip(x.tolist(), y.tolist(), p.tolist(), strict=True))
-    twin = burst_twin(first, t_start, t_end)
+    wide = burst_twin(first, t_end, t_start, t_end, 3)
+    twin = wide | burst_twin(first, t_end, 2 * t_start - t_end, t_start, 2)
     # Encoding rounds times to 1.5 us: events within that of a limit may fall on its other side.
     assert len(got ^ twin) <= 0.01 * len(twin)
-    assert len(twin) > 100
+    assert len(wide) > 100 and len(twin - wide) > 5
 
 
 def paper_twin(last: np.ndarray, t_start: int, t_end: int, share: float) -> set[tuple[int, int, int]]:

@@ -13,9 +13,9 @@ import numpy as np
 from numba import njit
 
 from velod.events.columns import readonly
-from velod.events.plane_fit import fit_plane
+from velod.events.plane_fit import REACH, PlaneFit, fit_plane, honest_rms, widen_plane
 from velod.geometry.rectify import Rectification
-from velod.types import F32, F64, I64, NS_PER_S, PATCH, U8, U16
+from velod.types import F32, F64, I64, NS_PER_S, U8, U16, WIDE
 
 # Plane fits as for the flow (DESIGN recipe, step 2).
 _REJECT_PX = 1.0
@@ -32,6 +32,10 @@ _MAX_RMS_PX = 0.35
 _MAX_STEPS = 2
 # Edges flatter than this slide along the row: their place on it is not observed.
 MIN_NORMAL_X = 0.15
+
+# Scatter of disparities, against the truth, over what white residuals would make of it: less than a flow's, since
+# what an edge's own shape does to its plane it does in both cameras.
+INFLATION = 1.1
 
 REFINED, NO_SEED, NO_LEFT_PLANE, FLAT_EDGE, NO_RIGHT_PLANE, FAR, SLOPES, RESIDUAL = range(8)
 OUTCOMES = (
@@ -54,7 +58,7 @@ class Refined:
     outcome: U8  # (n,)
     disparity: F64  # (n,) px
     normal_x: F64  # (n,) x of the rectified edge's unit normal, left
-    rms_px: F64  # (n,) residuals of both planes together, as a distance along their normals
+    sigma_px: F64  # (n,) of the disparity, from the residuals of both planes
 
 
 def refine(
@@ -86,24 +90,25 @@ def refine(
         rectification.right_covector,
         rectification.remap_right[0],
         rectification.remap_right[1],
-        np.empty(PATCH * PATCH),
+        np.empty((WIDE, WIDE)),
         out.outcome,
         out.disparity,
         out.normal_x,
-        out.rms_px,
+        out.sigma_px,
     )
     return out
 
 
 @njit(cache=True, nogil=True)
-def _patch(surface: U16, p: int, x: int, y: int, unit_s: float, age: F64) -> bool:
-    """Ages in s of the 5x5 neighbours of (x, y), 0 = none. False where they leave the sensor."""
-    if x < 2 or x >= surface.shape[2] - 2 or y < 2 or y >= surface.shape[1] - 2:
-        return False
-    for i in range(5):
-        for j in range(5):
-            age[5 * i + j] = surface[p, y + i - 2, x + j - 2] * unit_s
-    return True
+def _plane(surface: U16, p: int, x: int, y: int, unit_s: float, min_neighbours: int, age: F64) -> PlaneFit:
+    """The widened plane at (x, y), none as of ``fit_plane`` where its neighbours leave the sensor; ``age``: room."""
+    if x < REACH or x >= surface.shape[2] - REACH or y < REACH or y >= surface.shape[1] - REACH:
+        return 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(WIDE):
+        for j in range(WIDE):
+            age[i, j] = surface[p, y + i - REACH, x + j - REACH] * unit_s
+    fit = fit_plane(age[1:-1, 1:-1].copy().reshape(-1), _REJECT_PX, _REJECTIONS, min_neighbours)
+    return widen_plane(fit, age.reshape(-1), _REJECT_PX, _MAX_RMS_PX)[0] if fit[0] > 0 else fit
 
 
 @njit(cache=True, nogil=True)
@@ -128,6 +133,7 @@ def _refine_one(
     y_left: float,
     seed: float,
     t_left: float,
+    variance_left: float,
     gx_left: float,
     gy_left: float,
     right_covector: F32,
@@ -135,7 +141,7 @@ def _refine_one(
     map_y: F32,
     age: F64,
 ) -> tuple[int, float, float]:
-    """(outcome, disparity, rms of the right plane in px) from the left plane's time and rectified slope."""
+    """(outcome, disparity, its sigma) from the left plane's time, the variance of that, and rectified slope."""
     x = x_left - seed
     for _ in range(_MAX_STEPS):
         sensor_x = _bilinear(map_x, x, y_left)
@@ -143,9 +149,7 @@ def _refine_one(
         if not (math.isfinite(sensor_x) and math.isfinite(sensor_y)):
             return NO_RIGHT_PLANE, math.nan, math.nan
         px, py = round(sensor_x), round(sensor_y)
-        if not _patch(right, p, px, py, unit_s, age):
-            return NO_RIGHT_PLANE, math.nan, math.nan
-        n, gx, gy, t0, rms, _qxx, _qxy, _qyy = fit_plane(age, _REJECT_PX, _REJECTIONS, _MIN_NEIGHBOURS_RIGHT)
+        n, gx, gy, t0, rms, _qxx, _qxy, _qyy = _plane(right, p, px, py, unit_s, _MIN_NEIGHBOURS_RIGHT, age)
         if n == 0:
             return NO_RIGHT_PLANE, math.nan, math.nan
         M = right_covector[py, px]
@@ -160,12 +164,13 @@ def _refine_one(
         if abs(step) < _MAX_STEP_PX:
             slope = math.sqrt(gx_left * gx_left + gy_left * gy_left)
             difference = math.sqrt((gx_right - gx_left) ** 2 + (gy_right - gy_left) ** 2)
-            rms_px = rms / math.sqrt(gx * gx + gy * gy)
+            norm = math.sqrt(gx * gx + gy * gy)
             if difference > _MAX_SLOPE_DIFFERENCE * slope:
                 return SLOPES, math.nan, math.nan
-            if rms_px > _MAX_RMS_PX:
+            if rms > _MAX_RMS_PX * norm:
                 return RESIDUAL, math.nan, math.nan
-            return REFINED, x_left - x, rms_px
+            variance = variance_left + honest_rms(n, rms, norm) ** 2 / n
+            return REFINED, x_left - x, INFLATION * math.sqrt(variance) / abs(gx_right)
     return FAR, math.nan, math.nan
 
 
@@ -187,17 +192,15 @@ def _refine(
     outcome: U8,
     disparity: F64,
     normal_x: F64,
-    rms_px: F64,
+    sigma_px: F64,
 ) -> None:
     for k in range(x.shape[0]):
         xk, yk, pk = int(x[k]), int(y[k]), int(p[k])
         disparity[k] = math.nan
         normal_x[k] = math.nan
-        rms_px[k] = math.nan
+        sigma_px[k] = math.nan
         outcome[k] = NO_LEFT_PLANE
-        if not _patch(left, pk, xk, yk, unit_s, age):
-            continue
-        n, gx, gy, t_left, rms, _qxx, _qxy, _qyy = fit_plane(age, _REJECT_PX, _REJECTIONS, _MIN_NEIGHBOURS)
+        n, gx, gy, t_left, rms, _qxx, _qxy, _qyy = _plane(left, pk, xk, yk, unit_s, _MIN_NEIGHBOURS, age)
         if n == 0:
             continue
         M = left_covector[yk, xk]
@@ -213,7 +216,7 @@ def _refine(
         if abs(normal_x[k]) < MIN_NORMAL_X:
             outcome[k] = FLAT_EDGE
             continue
-        outcome[k], disparity[k], right_rms_px = _refine_one(
+        outcome[k], disparity[k], sigma_px[k] = _refine_one(
             right,
             unit_s,
             pk,
@@ -221,6 +224,7 @@ def _refine(
             float(left_xy[yk, xk, 1]),
             float(seed[k]),
             t_left,
+            honest_rms(n, rms, math.sqrt(gx * gx + gy * gy)) ** 2 / n,
             gx_left,
             gy_left,
             right_covector,
@@ -228,5 +232,3 @@ def _refine(
             map_y,
             age,
         )
-        # One age buffer serves both planes: the left one's numbers are already out of it.
-        rms_px[k] = math.sqrt((rms / math.sqrt(gx * gx + gy * gy)) ** 2 + right_rms_px**2)

@@ -17,9 +17,6 @@ from velod.types import F32, F64, I64, DepthBatch, StereoBatch
 
 Bools = NDArray[np.bool_]
 
-# Residual of the planes for which a refined match has just the sigma of the settings, and the least sigma's share.
-_TYPICAL_RMS_PX = 0.2
-_LEAST_SIGMA_SHARE = 0.3
 # Block matching along an edge that lies in the row: twice the spread of other edges, and an error that neighbours
 # share, so that it must not average out.
 _FLAT_EDGE_FACTOR = 4.0
@@ -164,13 +161,10 @@ class DepthStage:
         return out
 
     def _sigma_px(self, refined: Refined) -> F64:
-        """(n,) disparity sigma: for refined points from the planes' residuals and the edge's direction."""
+        """(n,) disparity sigma: for refined points from the planes' residuals and the edge's slope along the row."""
         s = self._settings
         block = np.where(refined.outcome == FLAT_EDGE, _FLAT_EDGE_FACTOR, 1.0) * s.sigma_zncc_px
-        share = np.maximum(refined.rms_px / _TYPICAL_RMS_PX, _LEAST_SIGMA_SHARE)
-        return np.asarray(
-            np.where(refined.outcome == REFINED, s.sigma_refined_px * share / np.abs(refined.normal_x), block)
-        )
+        return np.asarray(np.where(refined.outcome == REFINED, np.hypot(refined.sigma_px, s.sigma_refined_px), block))
 
     def _publish(
         self, message: StereoBatch, disparity: F64, sigma_px: F64, is_refined: Bools, accepted: Bools

@@ -1,7 +1,10 @@
-"""Plane through the 5x5 same-polarity neighbours of an event on the surface of active events (Eq. 5).
+"""Plane through the same-polarity neighbours of an event on the surface of active events (Eq. 5).
 
 The surface is locally t(x, y) = gx (x - x0) + gy (y - y0) + t0, where (gx, gy) is the SAE's gradient
 ``grad_T`` in s/px (Eq. 6 reads the normal flow off it) and t0 the time of the plane at the centre pixel.
+
+A plane is found in the paper's 5x5 neighbours and then widened to those of the 7x7 that lie on it as well: the
+slope's variance falls to a quarter, and a neighbour on another edge does no harm, since the plane is known by then.
 """
 
 from __future__ import annotations
@@ -11,12 +14,21 @@ import math
 import numpy as np
 from numba import njit
 
-from velod.types import F64, PATCH
+from velod.types import F64, PATCH, WIDE
 
 SIZE = PATCH * PATCH
 HALF = PATCH // 2
+WIDE_SIZE = WIDE * WIDE
+REACH = WIDE // 2
+RING_ROW, RING_COLUMN = np.argwhere(
+    np.pad(np.zeros((PATCH, PATCH)), (WIDE - PATCH) // 2, constant_values=1.0)
+).T.copy()
+"""Where in the 7x7 the neighbours around the 5x5 are, (24,) each, row-major."""
 MIN_DETERMINANT = 1e-3
 """A fit is near-singular when the determinant of the moments is below this share of the variances' product."""
+
+USUAL_RMS_PX, USUAL_WEIGHT = 0.15, 10.0
+"""The residual that fits usually have, px, and as how many neighbours it counts: a residual far below it is luck."""
 
 PlaneFit = tuple[int, float, float, float, float, float, float, float]
 """(n, gx, gy, t0, rms, qxx, qxy, qyy): see ``fit_plane``."""
@@ -101,3 +113,68 @@ def fit_plane(age: F64, reject_px: float, rejections: int, min_neighbours: int) 
             return int(n), gx, gy, t0, math.sqrt(rss * per_n), qxx, qxy, qyy
         kept &= ~outliers
     return 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+
+
+@njit(cache=True, nogil=True)
+def widen_plane(fit: PlaneFit, age: F64, reject_px: float, max_rms_px: float) -> tuple[PlaneFit, float]:
+    """The plane through those of the 7x7 neighbours that lie within ``reject_px`` of ``fit``.
+
+    ``age``: (49,) float64, row-major 7x7 patch, as that of ``fit_plane``; ``fit`` has been found in its middle.
+    Returns what ``fit_plane`` does, and by how much the residuals bend along the slope, s/px^2 (>= 0, half the second
+    derivative; as if no neighbour were missing). ``fit`` itself and 0 where the new plane is near-singular or its rms
+    residual is not below ``max_rms_px`` times its slope's norm.
+    """
+    _, gx, gy, t0, _, _, _, _ = fit
+    limit = reject_px * math.sqrt(gx * gx + gy * gy)
+    # Moments of the residuals: what the slope and the time of the new plane differ by follows from them.
+    i = n = x = y = xx = xy = yy = 0
+    r = xr = yr = rr = xxr = xyr = yyr = 0.0
+    for dy in range(-REACH, REACH + 1):
+        for dx in range(-REACH, REACH + 1):
+            residual = -age[i] - t0 - gx * dx - gy * dy
+            k = int(age[i] > 0.0) & int(abs(residual) <= limit)
+            n += k
+            x += k * dx
+            y += k * dy
+            xx += k * dx * dx
+            xy += k * dx * dy
+            yy += k * dy * dy
+            kr = k * residual
+            r += kr
+            xr += dx * kr
+            yr += dy * kr
+            rr += kr * residual
+            xxr += dx * dx * kr
+            xyr += dx * dy * kr
+            yyr += dy * dy * kr
+            i += 1
+    if n < 4:
+        return fit, 0.0
+    mx, my, mr = x / n, y / n, r / n
+    sxx, sxy, syy = xx - x * mx, xy - x * my, yy - y * my
+    sxr, syr = xr - x * mr, yr - y * mr
+    det = sxx * syy - sxy * sxy
+    if det <= MIN_DETERMINANT * sxx * syy:
+        return fit, 0.0
+    hx = (syy * sxr - sxy * syr) / det
+    hy = (sxx * syr - sxy * sxr) / det
+    gx += hx
+    gy += hy
+    rms = math.sqrt(max(rr - r * mr - hx * sxr - hy * syr, 0.0) / n)
+    slope2 = gx * gx + gy * gy
+    if not rms < max_rms_px * math.sqrt(slope2):
+        return fit, 0.0
+    # On the full grid x^2, x y and y^2 are orthogonal to the plane (but for their means) and to each other.
+    a, b, c = (xxr - 4.0 * r) / 588.0, (yyr - 4.0 * r) / 588.0, xyr / 784.0
+    bend = abs(gx * gx * a + gy * gy * b + gx * gy * c) / slope2
+    return (n, gx, gy, t0 + mr - hx * mx - hy * my, rms, syy / det, -sxy / det, sxx / det), bend
+
+
+@njit(cache=True, nogil=True)
+def honest_rms(n: int, rms: float, slope: float) -> float:
+    """Standard deviation of a neighbour's time about the true plane, s, from a fit's ``n``, ``rms`` and slope's norm.
+
+    The mean of what the residuals say, less the three parameters fitted to them, and of what is usual.
+    """
+    usual = USUAL_RMS_PX * slope
+    return math.sqrt((n * rms * rms + USUAL_WEIGHT * usual * usual) / (n - 3 + USUAL_WEIGHT))

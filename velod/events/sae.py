@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numba import njit
 
-from velod.events.plane_fit import HALF, SIZE
+from velod.events.plane_fit import HALF, REACH, RING_COLUMN, RING_ROW, SIZE
 from velod.types import I64, PATCH, U8, U16, U32
 
 NEVER = -(2**62)
@@ -67,11 +67,14 @@ def encode_ages(stamp: I64, t_end_ns: int, memory_ns: int) -> U16:
 
 
 @njit(cache=True, nogil=True)
-def gather_patches(surface: I64, x: U16, y: U16, p: U8, t_end_ns: int, memory_ns: int, age: U32, patch: U32) -> None:
-    """Ages (ns before ``t_end_ns``) of the events and of their 5x5 same-polarity neighbours on ``surface``.
+def gather_patches(
+    surface: I64, x: U16, y: U16, p: U8, t_end_ns: int, memory_ns: int, age: U32, patch: U32, ring: U32
+) -> None:
+    """Ages (ns before ``t_end_ns``) of the events and of their same-polarity neighbours on ``surface``.
 
-    Writes ``age`` (n,) and ``patch`` (n, 25) row-major, 0 where the stamp is older than ``memory_ns``. Events must
-    be at least 2 px inside.
+    Writes ``age`` (n,), ``patch`` (n, 25) of the 5x5, row-major, and ``ring`` (n, 24) of the rest of the 7x7; 0 where
+    the stamp is older than ``memory_ns``. A ``ring`` without rows is left alone. Events must be at least 2 px inside,
+    3 px with a ring.
     """
     for i in range(x.size):
         k, r0, c0 = p[i], np.int64(y[i]) - HALF, np.int64(x[i]) - HALF
@@ -79,3 +82,8 @@ def gather_patches(surface: I64, x: U16, y: U16, p: U8, t_end_ns: int, memory_ns
             a = t_end_ns - surface[k, r0 + j // PATCH, c0 + j % PATCH]
             patch[i, j] = np.uint32(a) if 0 < a <= memory_ns else np.uint32(0)
         age[i] = patch[i, SIZE // 2]
+    for i in range(ring.shape[0]):
+        k, r0, c0 = p[i], np.int64(y[i]) - REACH, np.int64(x[i]) - REACH
+        for j in range(ring.shape[1]):
+            a = t_end_ns - surface[k, r0 + RING_ROW[j], c0 + RING_COLUMN[j]]
+            ring[i, j] = np.uint32(a) if 0 < a <= memory_ns else np.uint32(0)

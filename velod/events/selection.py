@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from velod.events.plane_fit import HALF, SIZE, fit_plane
+from velod.events.plane_fit import HALF, REACH, SIZE, fit_plane
 from velod.events.sae import NEVER, age_unit_ns
 from velod.types import F64, I64, PATCH, U8, U16
 
@@ -48,27 +48,36 @@ def select_burst(
     quota: int,
     seq: int,
 ) -> tuple[U16, U16, U8]:
-    """First events of bursts whose edge has just passed the whole of their 5x5 neighbourhood.
+    """First events of bursts whose edge has just passed the whole of their neighbourhood.
 
     An event itself comes when its edge has crossed half of the neighbourhood; the plane can be fitted without bias
-    only once the other half has fired too. So an event is selected in the batch that completes it: the newest of its
-    outer same-polarity neighbours on ``first`` (2, h, w), int64 ns, lies in [t_start_ns, t_end_ns), and a plane
-    leaves ``min_neighbours`` of 25 after rejection (see ``fit_plane``) with an rms below ``max_rms_px``. It is at
-    most half the memory old, so it may be older than the batch.
+    only once the other half has fired too. So an event is selected in the batch that completes its 7x7: the newest of
+    its outer same-polarity neighbours on ``first`` (2, h, w), int64 ns, lies in [t_start_ns, t_end_ns), and a plane
+    leaves ``min_neighbours`` of the inner 25 after rejection (see ``fit_plane``) with an rms below ``max_rms_px``. It
+    is at most half the memory old, so it may be older than the batch.
+
+    What the quota leaves room for are events with a 5x5 alone, completed in the time before that is as long as the
+    batch: edges too short or too curved for a 7x7.
 
     ``encoded`` is ``encode_ages(first, t_end_ns, memory_ns)``. ``taken`` (2, h, w) holds the stamps selected before:
     those are skipped, and the new ones are entered.
 
     Returns columns x, y, p in the order of the surface (p, y, x).
     """
-    mask = np.zeros(first.shape, np.uint8)
     unit_ns = age_unit_ns(memory_ns)
-    _mark_passed(encoded, memory_ns // 2 // unit_ns, -((t_start_ns - t_end_ns) // unit_ns), mask)
-    chosen = _choose(
-        first, mask, t_end_ns, memory_ns, border_px, quota, seq,
-        True, reject_px, rejections, min_neighbours, max_rms_px, taken,
-    )  # fmt: skip
-    taken.reshape(-1)[chosen] = first.reshape(-1)[chosen]
+    span = -((t_start_ns - t_end_ns) // unit_ns)
+    chosen = np.empty(0, np.int32)
+    for reach_px, since, until in ((REACH, span, 0), (HALF, 2 * span, span)):
+        room = quota - len(chosen)
+        if room > 0:
+            mask = np.zeros(first.shape, np.uint8)
+            _mark_passed(encoded, reach_px, memory_ns // 2 // unit_ns, since, until, mask)
+            more = _choose(
+                first, mask, t_end_ns, memory_ns, border_px, room, seq,
+                True, reject_px, rejections, min_neighbours, max_rms_px, taken,
+            )  # fmt: skip
+            taken.reshape(-1)[more] = first.reshape(-1)[more]
+            chosen = np.concatenate([chosen, more])
     return _columns(chosen, first)
 
 
@@ -133,7 +142,7 @@ def _choose(
     columns = -(-w // cell_px)
     index = np.empty(surface.size, np.int32)
     cell_end = np.zeros(columns * -(-h // cell_px) + 1, np.int32)
-    _candidates(surface, taken, mask, max(border_px, HALF), cell_px, columns, index, cell_end)
+    _candidates(surface, taken, mask, max(border_px, REACH), cell_px, columns, index, cell_end)
     chosen = np.empty(quota, np.int32)
     n = _take_in_turn(
         surface, t_end_ns, memory_ns, burst, tolerance, rejections, min_neighbours,
@@ -143,24 +152,22 @@ def _choose(
 
 
 @njit(cache=True, nogil=True)
-def _mark_passed(age: U16, reach: int, span: int, mask: U8) -> None:
-    """Mark pixels whose eight outer neighbours lie symmetrically about them in time, as on a plane.
+def _mark_passed(age: U16, reach_px: int, oldest: int, since: int, until: int, mask: U8) -> None:
+    """Mark pixels whose eight neighbours ``reach_px`` away lie symmetrically about them in time, as on a plane.
 
-    A filter that vectorises, and spares most of the fits. The pixel's ``age`` must be within ``reach``, that of its
-    newest outer neighbour within ``span``; all in encoded steps, of which 0 counts as oldest.
+    A filter that vectorises, and spares most of the fits. The pixel's ``age`` must be below ``oldest``, that of its
+    newest outer neighbour below ``since`` and at least ``until``; all in encoded steps, of which 0 counts as oldest.
     """
     _, h, w = age.shape
-    if w < PATCH:
-        return
-    n = w - PATCH + 1
+    n = w - 2 * reach_px
     for k in range(2):
-        for r in range(HALF, h - HALF):
-            up, row, down = age[k, r - HALF], age[k, r], age[k, r + HALF]
-            marks = mask[k, r, HALF : w - HALF]
-            w0, e0 = row[:n], row[PATCH - 1 :]
-            nw, n0, ne = up[:n], up[HALF : w - HALF], up[PATCH - 1 :]
-            sw, s0, se = down[:n], down[HALF : w - HALF], down[PATCH - 1 :]
-            c0 = row[HALF : w - HALF]
+        for r in range(reach_px, h - reach_px):
+            up, row, down = age[k, r - reach_px], age[k, r], age[k, r + reach_px]
+            marks = mask[k, r, reach_px : w - reach_px]
+            w0, e0 = row[:n], row[2 * reach_px :]
+            nw, n0, ne = up[:n], up[reach_px : w - reach_px], up[2 * reach_px :]
+            sw, s0, se = down[:n], down[reach_px : w - reach_px], down[2 * reach_px :]
+            c0 = row[reach_px : w - reach_px]
             for i in range(n):
                 t = _oldest_if_none(c0[i])
                 a, b = _oldest_if_none(w0[i]) - t, _oldest_if_none(e0[i]) - t
@@ -171,7 +178,8 @@ def _mark_passed(age: U16, reach: int, span: int, mask: U8) -> None:
                 antisymmetric = abs(a - b) + abs(c - d) + abs(e - f) + abs(g - j)
                 plane = np.float32(symmetric) <= np.float32(MAX_ASYMMETRY) * np.float32(antisymmetric)
                 newest = min(min(min(a, b), min(c, d)), min(min(e, f), min(g, j)))
-                marks[i] = np.uint8(plane & (t < reach) & (newest + t < span))
+                passed = newest + t
+                marks[i] = np.uint8(plane & (t < oldest) & (passed < since) & (passed >= until))
 
 
 @njit(cache=True, nogil=True, inline="always")

@@ -7,20 +7,22 @@ import math
 import numpy as np
 from numba import njit
 
-from velod.events.plane_fit import SIZE, fit_plane
-from velod.types import F32, I64, U16, U32
+from velod.events.plane_fit import RING_COLUMN, RING_ROW, SIZE, fit_plane, honest_rms, widen_plane
+from velod.types import F32, F64, I64, PATCH, RING, U16, U32, WIDE
 
 REFUSALS = ("unfit", "rms", "speed", "unrectified")
 """Why an event gets no flow: no plane (too few neighbours or singular), rms gate, speed gate, outside the lens."""
 
 _UNFIT, _RMS, _SPEED, _UNRECTIFIED = range(4)
 
-FIT_INFLATION = 1.1
-SHARE_FLOOR = 0.006
-"""Sigma's share of the speed is FIT_INFLATION times the fit's own and this floor, which no residual shows."""
+INFLATION = 1.2
+"""Scatter of flows, against the truth, over what white residuals would make of it: neighbours share errors."""
+BEND_PX = 1.0
+"""Where the surface bends along n, sigma lets in the change of slope over half of this: what is seen of a bend tells
+of what is not seen of it, which turns the plane."""
 
-NORMAL_TO_FULL = 1.25
-"""Full image motion over the mean normal flow of a batch (pi/2 for edges of all directions, 1 for one direction)."""
+MOTION_UNIT_PX = 100.0
+"""Distances from the flows' mean position are in this unit in the affine image motion."""
 
 
 @njit(cache=True, nogil=True)
@@ -28,6 +30,7 @@ def fit_flows(
     x: U16,
     y: U16,
     patch: U32,
+    ring: U32,
     xy: F32,
     covector: F32,
     reject_px: float,
@@ -42,20 +45,28 @@ def fit_flows(
 ) -> int:
     """Flows of n events at sensor pixels ``x``, ``y`` (n,) with ``patch`` (n, 25) ages in ns, 0 = none.
 
+    ``ring`` holds the ages around them, (n, 24), or has no rows: then the planes stay on their 5x5 neighbours.
     ``xy`` (h, w, 2) and ``covector`` (h, w, 2, 2) take sensor pixels and SAE gradients to the rectified image.
     Writes for each of the m flows its position in the batch to ``index`` and (x, y, nx, ny, speed, sigma) in
     rectified px and px/s to ``flow`` (n, 6); adds the others to ``refused`` by cause. Returns m.
     """
-    age = np.empty(SIZE, np.float64)
+    age, wide = np.empty(SIZE, np.float64), np.empty((WIDE, WIDE), np.float64)
+    turn = np.empty(x.size, np.float64)
     m = 0
-    total = 0.0
     for i in range(x.size):
         for j in range(SIZE):
             age[j] = patch[i, j] * 1e-9
-        n, gx, gy, _, rms, qxx, qxy, qyy = fit_plane(age, reject_px, rejections, min_neighbours)
-        if n == 0:
+        fit = fit_plane(age, reject_px, rejections, min_neighbours)
+        if fit[0] == 0:
             refused[_UNFIT] += 1
             continue
+        bend = 0.0
+        if len(ring) > 0:
+            wide[1:-1, 1:-1] = age.reshape(PATCH, PATCH)
+            for j in range(RING):
+                wide[RING_ROW[j], RING_COLUMN[j]] = ring[i, j] * 1e-9
+            fit, bend = widen_plane(fit, wide.reshape(-1), reject_px, max_rms_px)
+        n, gx, gy, _, rms, qxx, qxy, qyy = fit
         if not rms < max_rms_px * math.hypot(gx, gy):
             refused[_RMS] += 1
             continue
@@ -74,11 +85,13 @@ def fit_flows(
             continue
         # Eq. 6: the normal flow is grad_T / |grad_T|^2.
         nx, ny, speed = tx / grad_T, ty / grad_T, 1.0 / grad_T
-        # Slope along n, seen from the sensor's axes, and its variance from the fit's covariance.
-        ux, uy = a * nx + d * ny, b * nx + e * ny
-        sigma_t = rms * math.sqrt(n / max(n - 3, 1))
-        sigma_grad = sigma_t * math.sqrt(qxx * ux * ux + 2.0 * qxy * ux * uy + qyy * uy * uy)
-        share = FIT_INFLATION * math.hypot(speed * sigma_grad, SHARE_FLOOR)
+        # Variances of the slope along n and across it, as shares of the slope: errors of speed and of direction.
+        sigma_t = INFLATION * honest_rms(n, rms, math.hypot(gx, gy))
+        along = math.hypot(
+            speed * sigma_t * _deviation(qxx, qxy, qyy, a * nx + d * ny, b * nx + e * ny),
+            BEND_PX * bend / math.hypot(gx, gy),
+        )
+        across = speed * sigma_t * _deviation(qxx, qxy, qyy, d * nx - a * ny, e * nx - b * ny)
         if benosman:
             # Per-component reciprocal (Benosman 2014), the baseline of Table II.
             bx = 1.0 / tx if tx != 0.0 else 0.0
@@ -91,10 +104,65 @@ def fit_flows(
         flow[m, 2] = nx
         flow[m, 3] = ny
         flow[m, 4] = speed
-        flow[m, 5] = share
-        total += speed
+        flow[m, 5] = along * speed
+        turn[m] = across
         m += 1
-    # An error in n lets in the motion along the edge, which a flow does not know but the batch does.
-    for i in range(m):
-        flow[i, 5] *= max(float(flow[i, 4]), NORMAL_TO_FULL * total / m)
+    if m > 0:
+        _let_in_motion_along_edges(flow[:m], turn[:m])
     return m
+
+
+@njit(cache=True, nogil=True)
+def _let_in_motion_along_edges(flow: F32, turn: F64) -> None:
+    """Add to the sigmas what an error ``turn`` (m,), rad, of n lets in of the motion along the edge.
+
+    A flow does not know that motion, but the batch does: u(x, y) = a + b x + c y, fitted to n . u = speed. What the
+    fit leaves counts as unknown, and for its six parameters as much as six flows. The unit diagonal holds down what
+    the edges do not determine.
+    """
+    m = len(flow)
+    x = np.ascontiguousarray(flow[:, 0]).astype(np.float64)
+    y = np.ascontiguousarray(flow[:, 1]).astype(np.float64)
+    x, y = (x - x.mean()) / MOTION_UNIT_PX, (y - y.mean()) / MOTION_UNIT_PX
+    row, H, u = np.empty(6), np.eye(6), np.zeros(6)
+    for i in range(m):
+        nx, ny = np.float64(flow[i, 2]), np.float64(flow[i, 3])
+        row[:] = nx, ny, nx * x[i], ny * x[i], nx * y[i], ny * y[i]
+        for j in range(6):
+            u[j] += row[j] * flow[i, 4]
+            for k in range(j + 1):
+                H[j, k] += row[j] * row[k]
+    _solve_in_place(H, u)
+    left2 = 6.0 * np.mean(flow[:, 4].astype(np.float64) ** 2) / m
+    for i in range(m):
+        ux, uy = u[0] + u[2] * x[i] + u[4] * y[i], u[1] + u[3] * x[i] + u[5] * y[i]
+        left2 += (flow[i, 4] - flow[i, 2] * ux - flow[i, 3] * uy) ** 2 / m
+    for i in range(m):
+        ux, uy = u[0] + u[2] * x[i] + u[4] * y[i], u[1] + u[3] * x[i] + u[5] * y[i]
+        along_edge2 = (flow[i, 2] * uy - flow[i, 3] * ux) ** 2 + left2
+        flow[i, 5] = math.sqrt(np.float64(flow[i, 5]) ** 2 + along_edge2 * turn[i] ** 2)
+
+
+@njit(cache=True, nogil=True)
+def _solve_in_place(H: F64, x: F64) -> None:
+    """x becomes H^-1 x, H its own Cholesky factor; H is positive definite, given by its lower triangle."""
+    n = len(x)
+    for i in range(n):
+        for j in range(i + 1):
+            s = H[i, j]
+            for k in range(j):
+                s -= H[i, k] * H[j, k]
+            H[i, j] = math.sqrt(s) if i == j else s / H[j, j]
+        for k in range(i):
+            x[i] -= H[i, k] * x[k]
+        x[i] /= H[i, i]
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            x[i] -= H[k, i] * x[k]
+        x[i] /= H[i, i]
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _deviation(qxx: float, qxy: float, qyy: float, ux: float, uy: float) -> float:
+    """Root of u^T Q u."""
+    return math.sqrt(qxx * ux * ux + 2.0 * qxy * ux * uy + qyy * uy * uy)

@@ -12,7 +12,7 @@ from velod.events.plane_fit import SIZE
 from velod.flow.kernel import REFUSALS, fit_flows
 from velod.geometry.calibration import Calibration
 from velod.geometry.rectify import rectify
-from velod.types import EventBatch, FlowBatch
+from velod.types import RING, EventBatch, FlowBatch
 
 
 class FlowStage:
@@ -39,7 +39,8 @@ class FlowStage:
         flow = np.empty((size, 6), np.float32)
         refused = np.zeros(len(REFUSALS), np.int64)
         n = fit_flows(
-            readonly(m.x, np.uint16), readonly(m.y, np.uint16), readonly(m.patch, np.uint32),
+            readonly(m.x, np.uint16), readonly(m.y, np.uint16),
+            readonly(m.patch, np.uint32), readonly(m.ring, np.uint32),
             self._xy, self._covector,
             s.reject_px, s.rejections, s.min_neighbours, s.max_rms_px, s.max_speed_px_s, s.method == "benosman",
             index, flow, refused,
@@ -56,6 +57,8 @@ class FlowStage:
     def _well_formed(self, m: EventBatch) -> bool:
         h, w = self._xy.shape[:2]
         size = len(m.x)
-        if not len(m.y) == len(m.age) == len(m.p) == size or m.patch.shape != (size, SIZE) or size > 65_535:
+        if not len(m.y) == len(m.age) == len(m.p) == size or size > 65_535:
+            return False
+        if m.patch.shape != (size, SIZE) or m.ring.shape not in ((size, RING), (0, RING)):
             return False
         return size == 0 or (int(m.x.max()) < w and int(m.y.max()) < h)

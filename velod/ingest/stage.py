@@ -22,7 +22,7 @@ from velod.ingest.imu import ImuStream
 from velod.ingest.ordering import ClockRestart
 from velod.ingest.slices import Slices
 from velod.ingest.stream import CameraStream
-from velod.types import F64, I64, U8, U16, EventBatch, EventPacket, ImuPacket, ImuSamples, StereoBatch
+from velod.types import F64, I64, RING, U8, U16, U32, EventBatch, EventPacket, ImuPacket, ImuSamples, StereoBatch
 
 Output = EventBatch | StereoBatch | ImuSamples
 
@@ -192,8 +192,8 @@ class IngestStage:
         )
         event_batches: list[EventBatch]
         if self._slices is None:
-            x, y, age, p, patch = self._select(left, t_start_ns, t_end_ns)
-            event_batches = [EventBatch(seq, t_end_ns, t_start_ns, n_events, x, y, age, p, patch, seq)]
+            x, y, age, p, patch, ring = self._select(left, t_start_ns, t_end_ns)
+            event_batches = [EventBatch(seq, t_end_ns, t_start_ns, n_events, x, y, age, p, patch, seq, ring=ring)]
         else:
             x, y, age, p = self._slices.selected(t_end_ns)
             event_batches = self._slices.rest_of(self._open, seq, t_end_ns)
@@ -205,7 +205,8 @@ class IngestStage:
             self._no_samples(t_end_ns),
         ]
 
-    def _select(self, encoded: U16, t_start_ns: int, t_end_ns: int) -> tuple[U16, U16, np.ndarray, U8, np.ndarray]:
+    def _select(self, encoded: U16, t_start_ns: int, t_end_ns: int) -> tuple[U16, U16, U32, U8, U32, U32]:
+        """x, y, age, p, patch and ring of an EventBatch: the paper's rules go with the paper's 5x5 alone."""
         s, fit, memory_ns = self._settings.ingest, self._settings.flow, self._memory_ns
         quota = self.budget.quota(s.quota)
         if s.selection == "burst":
@@ -224,8 +225,9 @@ class IngestStage:
                 border_px=s.border_px, quota=quota, seq=self._batch_seq,
             )  # fmt: skip
         age, patch = np.empty(len(x), np.uint32), np.empty((len(x), SIZE), np.uint32)
-        gather_patches(surface, x, y, p, t_end_ns, memory_ns, age, patch)
-        return x, y, age, p, patch
+        ring = np.empty((len(x) if s.selection == "burst" else 0, RING), np.uint32)
+        gather_patches(surface, x, y, p, t_end_ns, memory_ns, age, patch, ring)
+        return x, y, age, p, patch, ring
 
     def _no_samples(self, t_end_ns: int) -> ImuSamples:
         """Tells the optimizer how far the events have come without waiting for the IMU."""
