@@ -515,7 +515,10 @@ def _add_prove(commands: _Commands[argparse.ArgumentParser]) -> None:
         help="What is claimed of hostile networks, load and time, tried out here.",
         description="Each is a trial on this machine alone, over loopback, and ends with what it saw; exits with 1\n"
         "where that is not as claimed.",
-        epilog="examples:\n  velod prove attacks        no certificate, forged velocity, floods, garbage, ...",
+        epilog="""\
+examples:
+  velod prove attacks                no certificate, forged velocity, floods, garbage, ...
+  velod prove fuzz --runs 10000000   bad inputs for every decoder, in half an hour""",
     )
     actions = parser.add_subparsers(title="trials", metavar="TRIAL", required=True)
 

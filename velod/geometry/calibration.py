@@ -309,7 +309,7 @@ def _check_camera(camera: Camera, where: str) -> None:
     for name, c, size in (("cx", camera.cx, camera.width), ("cy", camera.cy, camera.height)):
         if not 0.0 < c < size - 1:
             raise CalibrationError(f"{where}.{name}: principal point outside the image, got {c:g} of {size} px")
-    if camera.model not in DIST_LENGTHS:
+    if not isinstance(camera.model, str) or camera.model not in DIST_LENGTHS:
         raise CalibrationError(f"{where}.model: must be one of {', '.join(DIST_LENGTHS)}, got {camera.model!r}")
     lengths = DIST_LENGTHS[camera.model]
     if len(camera.dist) not in lengths:

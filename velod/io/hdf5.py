@@ -11,23 +11,29 @@ from typing import Any
 import h5py
 import numpy as np
 
+from velod.geometry.calibration import CalibrationError
 from velod.io.model import EventColumns, Imu, RecordingError
 from velod.types import I64
 
 BLOCK = 1 << 18
 """Events read at a time."""
 
+# What h5py raises over a damaged file, and numpy over what it read from one.
+_LIBRARY_ERRORS = (OSError, RuntimeError, KeyError, ValueError, TypeError, AttributeError, OverflowError, MemoryError)
+
 
 @contextmanager
 def opened(path: Path) -> Iterator[Any]:
-    """An open file; errors of the library inside the block become one RecordingError."""
+    """An open file; errors of the library inside the block, of whatever kind, become one RecordingError."""
     if not path.is_file():
         raise RecordingError(f"{path}: no such file")
     _register_filters()
     try:
         with h5py.File(path, "r") as file:
             yield file
-    except OSError as e:
+    except (RecordingError, CalibrationError):
+        raise
+    except _LIBRARY_ERRORS as e:
         raise RecordingError(f"{path}: {_cause(path, str(e))}") from None
 
 
