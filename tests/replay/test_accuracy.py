@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from velod.eval.front_end import FrontEnd
 from velod.eval.metrics import Metrics, evaluate
 from velod.eval.scene_truth import TrueDepth
 from velod.eval.stage_errors import StageErrors, stage_errors
+from velod.eval.stage_tables import as_json
 from velod.geometry.calibration import Calibration
 from velod.io import Recording, open_recording
 from velod.runtime.offline import run_offline
@@ -101,6 +103,16 @@ def test_groups_hold_every_event_once(run: Run) -> None:
         assert sum(group.depth.n for group in errors.groups[what]) == errors.depth.n, what
     assert sum(group.flow.n for group in errors.groups["flow"]) == errors.flow.n
     assert sum(group.flow.n for group in errors.groups["edge direction, |n_x|"]) == errors.flow.n
+
+
+def test_a_batch_without_a_flow_or_a_depth_is_judged_like_one_that_is_missing(run: Run) -> None:
+    def emptied(batch: FlowBatch | DepthBatch, columns: tuple[str, ...]) -> Any:
+        return replace(batch, **{c: getattr(batch, c)[:0] for c in columns})
+
+    flows = [emptied(run.flows[0], ("index", "age", "x", "y", "n", "speed", "sigma")), *run.flows[1:]]
+    depths = [emptied(run.depths[0], ("index", "disparity", "inv_depth", "sigma", "refined")), *run.depths[1:]]
+    without = replace(run, flows=run.flows[1:], depths=run.depths[1:]).stage_errors()
+    assert as_json(replace(run, flows=flows, depths=depths).stage_errors()) == as_json(without)
 
 
 def test_a_depth_that_is_missing_lowers_the_share_of_events_with_a_depth(run: Run) -> None:

@@ -231,7 +231,8 @@ def _spread_out(
     at = np.concatenate([np.empty(0, np.int64), *rows])
     out = {}
     for name in names:
-        parts = [getattr(b, name).astype(np.float64).reshape(len(b.index), -1) for b in batches if b.seq in begin]
+        columns = [getattr(b, name).astype(np.float64) for b in batches if b.seq in begin]
+        parts = [c if c.ndim == 2 else c[:, None] for c in columns]
         out[name] = np.full((n, parts[0].shape[1] if parts else 2), np.nan)
         out[name][at] = np.concatenate(parts) if parts else np.empty((0, 2))
     return out
