@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -24,10 +25,14 @@ _EFFECTS: tuple[tuple[str, str, Callable[[str], object], str, str], ...] = (
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Texture, IMU rate, contrast threshold and real-sensor effects."""
+    """Sensor, texture, IMU rate, contrast threshold and real-sensor effects."""
     parser.add_argument(
         "--imu-hz", type=int, metavar="HZ", help="rate of the IMU, a divisor of 1,000,000 (default 200)"
     )
+    parser.add_argument(
+        "--sensor", type=_size, default=(346, 260), metavar="WxH",
+        help="columns and rows of both cameras, such as 640x480 (default 346x260)",
+    )  # fmt: skip
     parser.add_argument("--texture", type=int, metavar="SEED", help="other leaves on walls and boxes")
     parser.add_argument("--threshold", type=float, metavar="C", help="contrast at which pixels fire (default 0.5)")
     group = parser.add_argument_group("real-sensor effects", "All off unless given.")
@@ -55,7 +60,14 @@ def recipe_of(args: argparse.Namespace) -> Sequence:
         events = replace(events, threshold_sigma=args.threshold_spread)
     if args.imu_hz is not None:
         imu = replace(imu, rate_hz=args.imu_hz)
-    return replace(recipe, effects=effects, events=events, imu=imu)
+    return replace(recipe, effects=effects, events=events, imu=imu, sensor=args.sensor)
+
+
+def _size(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r"(\d{2,4})x(\d{2,4})", text)
+    if match is None or not all(32 <= int(side) <= 4096 for side in match.groups()):
+        raise argparse.ArgumentTypeError(f"must be WIDTHxHEIGHT, each from 32 to 4096, got {text!r}")
+    return int(match[1]), int(match[2])
 
 
 def _coefficients(text: str) -> tuple[float, ...]:

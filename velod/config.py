@@ -22,9 +22,11 @@ def _f(
     hi: float | None = None,
     above: float | None = None,
     choices: tuple[str, ...] | None = None,
+    or_0: bool = False,
 ) -> Any:
-    """A setting with its default, its meaning and what is allowed (lo <= value <= hi, value > above)."""
-    return field(default=default, metadata={"doc": doc, "lo": lo, "hi": hi, "above": above, "choices": choices})
+    """A setting with its default, its meaning and what is allowed (lo <= value <= hi, value > above; or 0)."""
+    allowed = {"lo": lo, "hi": hi, "above": above, "choices": choices, "or_0": or_0}
+    return field(default=default, metadata={"doc": doc, **allowed})
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,8 +54,20 @@ class IngestSettings:
         "what closes a batch: 'count', 'time', or 'first' of both",
         choices=("first", "count", "time"),
     )
-    count: int = _f(45_000, "left events in a batch (Sec. V-A)", lo=100, hi=10_000_000)
-    period_ms: float = _f(20.0, "longest batch, ms of sensor time", lo=1.0, hi=1000.0)
+    count: int = _f(
+        0,
+        "left events in a batch; 0: by the sensor's size, 45000 (Sec. V-A) for a DAVIS346",
+        lo=100,
+        hi=10_000_000,
+        or_0=True,
+    )
+    period_ms: float = _f(
+        0.0,
+        "longest batch, ms of sensor time; 0: by the sensor's size, 20 up to 640x480",
+        lo=1.0,
+        hi=1000.0,
+        or_0=True,
+    )
     memory_ms: float = _f(100.0, "how far back neighbours reach, ms; independent of the batch", lo=5.0, hi=1000.0)
     refractory_ms: float = _f(
         10.0,
@@ -66,7 +80,13 @@ class IngestSettings:
         "'burst': first events of bursts with full neighbourhoods; 'paper': the culling rules of Sec. V-A",
         choices=("burst", "paper"),
     )
-    quota: int = _f(500, "events selected from a batch at the most", lo=10, hi=20_000)
+    quota: int = _f(
+        0,
+        "events selected from a batch at the most; 0: by the sensor's size, 500 for a DAVIS346",
+        lo=10,
+        hi=20_000,
+        or_0=True,
+    )
     min_neighbours: int = _f(
         20, "neighbours (of 25, the event included) that a selected event must have", lo=6, hi=25
     )
@@ -126,7 +146,13 @@ class DepthSettings:
     workers: int = _f(1, "processes", lo=1, hi=64)
     tau_ms: float = _f(20.0, "decay of the time surfaces of block matching, ms", above=0.0, hi=1000.0)
     block_px: int = _f(17, "side of the matching block, odd", lo=5, hi=41)
-    max_disparity_px: int = _f(48, "bounds the nearest depth: f b / max_disparity", lo=4, hi=256)
+    max_disparity_px: int = _f(
+        0,
+        "bounds the nearest depth: f b / max_disparity; 0: by the sensor's width, 48 for a DAVIS346",
+        lo=4,
+        hi=256,
+        or_0=True,
+    )
     min_disparity_px: float = _f(0.5, "bounds the farthest depth", above=0.0, hi=32.0)
     min_zncc: float = _f(0.3, "matches below this correlation are refused", lo=-1.0, hi=1.0)
     check: str = _f(
@@ -292,7 +318,7 @@ def _value(value: Any, kind: type, meta: Any, where: str) -> Any:
         raise ConfigError(f"{where}: must be {_KIND[kind]}, got {value!r}")
     if meta["choices"] is not None and value not in meta["choices"]:
         raise ConfigError(f"{where}: must be one of {', '.join(meta['choices'])}, got {value!r}")
-    if kind in (int, float):
+    if kind in (int, float) and not (meta["or_0"] and value == 0):
         if value != value:
             raise ConfigError(f"{where}: is NaN")
         if meta["lo"] is not None and value < meta["lo"]:

@@ -11,6 +11,7 @@ from velod.config import Settings
 from velod.depth.refine import FLAT_EDGE, OUTCOMES, REFINED, Refined, refine
 from velod.depth.time_surface import TimeSurface, decay_table
 from velod.depth.zncc import Matches, Surface, match
+from velod.events.sensor_size import for_sensor
 from velod.geometry.calibration import Calibration
 from velod.geometry.rectify import rectify
 from velod.types import F32, F64, I64, DepthBatch, StereoBatch
@@ -27,7 +28,7 @@ class DepthStage:
 
     def __init__(self, settings: Settings, calibration: Calibration) -> None:
         self.counters: Counter[str] = Counter()
-        self._settings = settings.depth
+        self._settings = for_sensor(settings, calibration.left.width, calibration.left.height).depth
         self._rectification = rect = rectify(calibration)
         self._left_shape = (calibration.left.height, calibration.left.width)
         self._right_shape = (calibration.right.height, calibration.right.width)

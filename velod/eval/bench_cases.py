@@ -22,6 +22,7 @@ from velod.eval.bench import Case, Size
 from velod.eval.bench_input import RIG
 from velod.events.plane_fit import SIZE
 from velod.events.sae import new_surface, update_sae
+from velod.events.sensor_size import for_sensor
 from velod.flow.stage import FlowStage
 from velod.ingest.stage import IngestStage
 from velod.optimizer.estimator import Estimator
@@ -166,7 +167,7 @@ def sparse_depth(batch: StereoBatch) -> Case:
 
     Both from time surfaces: ours includes the integral images. As many disparities and as large a block.
     """
-    s = Settings().depth
+    s = for_sensor(Settings(), RIG.left.width, RIG.left.height).depth
     table = decay_table(batch.unit_ns, 1e-3 * s.tau_ms)
     left, right = np.take(table, batch.left_last), np.take(table, batch.right_last)
     x, y = batch.x.astype(np.int64), batch.y.astype(np.int64)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from velod.config import DepthSettings
 from velod.eval.scene_truth import JUMP, TrueDepth, motion_of_camera, rays
+from velod.events.sensor_size import max_disparity_px
 from velod.geometry.calibration import Calibration
 from velod.geometry.camera import motion_field_rows
 from velod.geometry.rectify import Rectification, rectify
@@ -113,6 +114,7 @@ def stage_errors(
 ) -> StageErrors:
     """Judge the batches of one run. ``settings`` tell where a depth can be had at all."""
     rect = rectify(calibration)
+    settings = replace(settings, max_disparity_px=max_disparity_px(settings, calibration.left.width))
     e = _Events.of(calibration, truth, true_depth, rect, selected, flows, depths)
     clear, has_flow, has_depth = e.known & ~e.jump, np.isfinite(e.ratio), np.isfinite(e.disparity_px)
     possible = clear & _matchable(e, rect, settings)

@@ -15,6 +15,7 @@ from velod.config import Settings
 from velod.events.plane_fit import SIZE
 from velod.events.sae import age_unit_ns, encode_ages, gather_patches, new_surface
 from velod.events.selection import select_burst, select_paper
+from velod.events.sensor_size import for_sensor
 from velod.geometry.calibration import Calibration
 from velod.ingest.batch import OpenBatch
 from velod.ingest.budget import Budget
@@ -39,6 +40,7 @@ class IngestStage:
         self.counters: Counter[str] = Counter()
         self.alarms: dict[str, str] = {}
         self.budget = Budget()
+        settings = for_sensor(settings, calibration.left.width, calibration.left.height)
         self._settings = settings
         self._calibration = calibration
         self._memory_ns = round(settings.ingest.memory_ms * 1e6)

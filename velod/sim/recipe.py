@@ -28,10 +28,17 @@ class Sequence:
     events: EventModel = field(default_factory=EventModel)
     effects: Effects = field(default_factory=Effects)
     imu: ImuModel = field(default_factory=ImuModel)
+    sensor: tuple[int, int] = (346, 260)  # columns and rows of both cameras
 
     @property
     def calibration(self) -> Calibration:
-        """A pair of DAVIS346 that look the same way; left camera = body = IMU. Undistorted but for the effects."""
+        """A pair of cameras that look the same way; left camera = body = IMU. Undistorted but for the effects.
+
+        Whatever the sensor's size, it sees as much of the scene from left to right as a DAVIS346.
+        """
         radtan = self.effects.radtan
-        camera = Camera(346, 260, 231.5, 231.5, 172.5, 129.5, "radtan" if radtan else "none", radtan)
+        width, height = self.sensor
+        f = 231.5 * width / 346
+        model = "radtan" if radtan else "none"
+        camera = Camera(width, height, f, f, (width - 1) / 2, (height - 1) / 2, model, radtan)
         return Calibration(camera, camera, np.eye(3), np.array([-BASELINE_M, 0.0, 0.0]))
