@@ -137,7 +137,7 @@ def _finish(
             output.json, {"velod": __version__, "commit": commit(), "command": command, **as_json(rows, seeds)}
         )
     if output.markdown is not None:
-        put_into(output.markdown, command, commit(), tables)
+        put_into(output.markdown, command, commit(), tables, said)
         print(f"wrote {output.markdown}", file=sys.stderr)
     if page is not None:
         for outcome in outcomes:

@@ -34,10 +34,10 @@ def run_jobs(jobs: Sequence[SequenceJob], processes: int) -> list[Outcome]:
     """The outcome of every job, in their order. Raises RunFailed where one failed, after the others are kept."""
     context = multiprocessing.get_context("spawn")
     notes, stop = context.Queue(), context.Event()
-    line, outcomes, failed = _Progress(len(jobs)), {}, []
+    line, outcomes, failed, code = _Progress(len(jobs)), {}, [], code_fingerprint()
     pool = ProcessPoolExecutor(processes, context, _begin, (notes, stop))
     try:
-        waiting: dict[Future[Outcome], SequenceJob] = {pool.submit(_kept_or_run, job): job for job in jobs}
+        waiting: dict[Future[Outcome], SequenceJob] = {pool.submit(_kept_or_run, job, code): job for job in jobs}
         while waiting:
             done, _ = wait(waiting, timeout=_LOOK_S, return_when=FIRST_COMPLETED)
             while not notes.empty():
@@ -92,8 +92,8 @@ def _begin(notes: Any, stop: Event) -> None:
     _in_worker = notes, stop
 
 
-def _kept_or_run(job: SequenceJob) -> Outcome:
-    path = _place(job)
+def _kept_or_run(job: SequenceJob, code: str) -> Outcome:
+    path = _place(job, code)
     try:
         with path.open("rb") as file:
             kept: Outcome = pickle.load(file)
@@ -107,10 +107,10 @@ def _kept_or_run(job: SequenceJob) -> Outcome:
     return outcome
 
 
-def _place(job: SequenceJob) -> Path:
+def _place(job: SequenceJob, code: str) -> Path:
     from velod.sim.driver import MODEL_VERSION, cache_directory
 
-    digest = hashlib.sha256(repr((MODEL_VERSION, code_fingerprint(), job)).encode()).hexdigest()
+    digest = hashlib.sha256(repr((MODEL_VERSION, code, job)).encode()).hexdigest()
     directory = cache_directory().parent / "eval"
     directory.mkdir(parents=True, exist_ok=True)
     return directory / f"{job.name}-{digest[:16]}.pickle"

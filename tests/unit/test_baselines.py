@@ -12,6 +12,7 @@ from velod.eval.baselines import benosman_settings, integrate_imu, paper_setting
 from velod.eval.dead_reckoning import attitude_at, dead_reckoning
 from velod.eval.floor import with_perfect_flow_and_depth
 from velod.eval.front_end import FrontEnd, SecondFlow, joined
+from velod.eval.imu_alone import imu_alone
 from velod.eval.metrics import evaluate, truth_at
 from velod.geometry.camera import motion_field_rows
 from velod.geometry.so3 import exp
@@ -263,3 +264,31 @@ def test_the_attitude_between_two_samples_lies_on_the_shortest_way() -> None:
     w = RECIPE.trajectory.at(np.array([t_ns * 1e-9]))
     np.testing.assert_allclose(attitude_at(TRUTH, t_ns), w.R_WB[0], atol=1e-5)
     assert np.linalg.norm(exp(w.omega_B[0] * 5e-4) - np.eye(3)) > 1e-4  # half a sample is no small thing
+
+
+# --- the IMU alone, over time ---
+
+
+def test_the_gyroscopes_noise_tilts_gravity_as_theory_says() -> None:
+    """A white rate of density s tilts by s sqrt(t); g of it goes into the velocity: g s sqrt(t^3 / 3) for each of
+    two axes. This is nine tenths of what the IMU of the paper accumulates in half a minute."""
+    seconds, noises = 20.0, 60
+    model = replace(RECIPE.imu.noiseless(), gyro_noise=RECIPE.imu.gyro_noise)
+    truth = true_motion(RECIPE.trajectory, seconds)
+    ends = []
+    for k in range(noises):
+        imu = sample_imu(RECIPE.trajectory, model, seconds, np.random.default_rng((k, 0)))
+        last = integrate_imu(imu, truth, Settings())[-1]
+        ends.append(last.v_B - truth_at(truth, np.array([last.t_ns]))[0])
+    expected = np.sqrt(2.0) * 9.81 * model.gyro_noise * np.sqrt(seconds**3 / 3.0)
+    # The root mean square of 120 numbers is known to 6 %; accelerations of the motion tilt with gravity.
+    assert np.sqrt(np.mean(np.sum(np.square(ends), axis=1))) == pytest.approx(expected, rel=0.2)
+
+
+def test_the_imu_alone_is_judged_up_to_each_moment() -> None:
+    noisy = [sample_imu(RECIPE.trajectory, RECIPE.imu, SECONDS, np.random.default_rng(k)) for k in (1, 2, 3)]
+    alone = imu_alone(noisy, TRUTH, Settings(), (1.0, 2.0))
+    assert alone.ave_mps.shape == (3, 2)
+    assert alone.ave_mps[0, 1] == pytest.approx(evaluate(integrate_imu(noisy[0], TRUTH, Settings()), TRUTH).ave_mps)
+    assert (alone.ave_mps[:, 0] < alone.ave_mps[:, 1]).all()
+    np.testing.assert_allclose(alone.share_below(float(np.sort(alone.ave_mps[:, 1])[1]) + 1e-9)[1], 2 / 3)

@@ -213,10 +213,11 @@ def test_tables_take_the_place_of_those_of_an_earlier_run(tmp_path: Path) -> Non
     page = tmp_path / "results.md"
     page.write_text("# A\n<!-- velod eval x -->\nold\n<!-- end -->\n\n<!-- velod eval y -->\n<!-- end -->\nlast\n")
     for value in ("1", "2"):
-        put_into(page, "velod eval x", "abc123", {"T": [["name", "n"], ["a", value]]})
+        put_into(page, "velod eval x", "abc123", {"T": [["name", "n"], ["a", value]]}, ["A note."])
     assert page.read_text() == (
-        "# A\n<!-- velod eval x -->\n`velod eval x` at `abc123`:\n\n```\nT\nname  n\na     2\n```\n<!-- end -->\n\n"
+        "# A\n<!-- velod eval x -->\n"
+        "`velod eval x` at `abc123`:\n\n```\nT\nname  n\na     2\n\nA note.\n```\n<!-- end -->\n\n"
         "<!-- velod eval y -->\n<!-- end -->\nlast\n"
     )
     with pytest.raises(MarkdownError, match="no place"):
-        put_into(page, "velod eval z", "abc123", {})
+        put_into(page, "velod eval z", "abc123", {}, [])

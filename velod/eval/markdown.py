@@ -13,8 +13,10 @@ class MarkdownError(ValueError):
     """A file that has no place for the tables; the text says which it looked for."""
 
 
-def put_into(path: str | Path, command: str, commit: str, tables: Mapping[str, Sequence[Sequence[str]]]) -> None:
-    """Replace what stands between ``<!-- COMMAND -->`` and ``<!-- end -->`` by the tables of that command.
+def put_into(
+    path: str | Path, command: str, commit: str, tables: Mapping[str, Sequence[Sequence[str]]], notes: Sequence[str]
+) -> None:
+    """Replace what stands between ``<!-- COMMAND -->`` and ``<!-- end -->`` by that command's tables and notes.
 
     Raises MarkdownError where the file has no such place, OSError where it cannot be read or written.
     """
@@ -24,5 +26,6 @@ def put_into(path: str | Path, command: str, commit: str, tables: Mapping[str, S
     if not place.search(text):
         raise MarkdownError(f"{path}: there is no place for these tables: {begin} ... <!-- end -->")
     blocks = "\n\n".join(f"{title}\n{text_table(lines)}" for title, lines in tables.items())
-    block = f"{begin}\n`{command}` at `{commit}`:\n\n```\n{blocks}\n```\n<!-- end -->"
+    said = "\n".join(notes)
+    block = f"{begin}\n`{command}` at `{commit}`:\n\n```\n{blocks}\n\n{said}\n```\n<!-- end -->"
     path.write_text(place.sub(lambda _: block, text), encoding="utf-8")

@@ -27,6 +27,7 @@ _COLOURS = {
 _TRAIL_PX = 4.0
 _ARROW_PX = 14.0
 _ARROWS = 220
+_LEAST_MPS = 1e-3  # what begins at the truth would stretch the axis without end
 
 
 def error_over_time(name: str, errors: Mapping[str, tuple[I64, F64, F64]]) -> Any:
@@ -39,8 +40,9 @@ def error_over_time(name: str, errors: Mapping[str, tuple[I64, F64, F64]]) -> An
             continue
         width = 1.8 if method == "velod" else 1.0
         label = f"{method}: AVE {error.mean():.3g} m/s"
-        axes.plot(t_ns / NS_PER_S, np.maximum(error, 1e-4), color=_COLOURS[method], lw=width, label=label)
+        axes.plot(t_ns / NS_PER_S, np.maximum(error, _LEAST_MPS), color=_COLOURS[method], lw=width, label=label)
     axes.set(yscale="log", xlabel="sensor time [s]", ylabel="|v_gt - v_est| [m/s]", title=name)
+    axes.set_ylim(bottom=max(axes.get_ylim()[0], _LEAST_MPS))
     axes.grid(alpha=0.3, which="both")
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), reverse=True, frameon=False)
     return figure
