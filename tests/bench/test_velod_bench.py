@@ -22,7 +22,7 @@ NAMES = {
     "depth": ["depth.sparse_500", "depth.worker"],
     "solve": ["solve.window", "output.imu_rate"],
     "codec": ["codec.batch"],
-    "pipeline": ["ingest.batch", "pipeline.one_process", "pipeline.sustained", "pipeline.event_to_flow"],
+    "pipeline": ["ingest.batch", "ingest.hd", "pipeline.one_process", "pipeline.sustained", "pipeline.event_to_flow"],
 }
 PEERS = {"flow.plane_fit": 1e-3, "depth.sparse_500": 0.5, "solve.window": 1e-3, "codec.batch": 0.0}
 """How far a case may be from its peer: relative speed, px, relative information, differing fields."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from velod.events.sae import NEVER, age_unit_ns, encode_ages, gather_patches, new_surface, update_sae
+from velod.events.sae import NEVER, age_unit_ns, encode_ages, encode_newest, gather_patches, new_surface, update_sae
 
 MS = 1_000_000
 
@@ -67,6 +67,8 @@ def test_encoded_ages_are_exact_ceilings(memory_ns: int) -> None:
     expected = np.where(age <= memory_ns, -(-age // unit), 0)
     assert np.array_equal(encode_ages(stamp, t_end, memory_ns), np.append(expected, [0, 0, 0]))
     assert expected.max() <= 65_535
+    both = np.stack([stamp, rng.permutation(stamp)])[:, :, None]
+    assert np.array_equal(encode_newest(both, t_end, memory_ns), encode_ages(both.max(axis=0), t_end, memory_ns))
 
 
 def test_patches_hold_same_polarity_ages_in_row_order() -> None:

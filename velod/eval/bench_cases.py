@@ -71,6 +71,7 @@ def cases(group: str, size: Size, run_pipeline: RunPipeline) -> Iterator[Case]:
         yield codec(selected(size))
     elif group == "pipeline":
         yield ingest(size)
+        yield large_ingest(size)
         yield one_process(size, run_pipeline)
     else:
         raise ValueError(f"no group {group!r}; groups: {', '.join(GROUPS)}")
@@ -333,6 +334,26 @@ def ingest(size: Size) -> Case:
         return [encode(message, 1) for packet in (left, right) for message in stage.handle(packet)]
 
     return Case("ingest.batch", run)
+
+
+def large_ingest(size: Size) -> Case:
+    """``ingest.hd``: a whole stream of a 1280x720 pair as ingest's process handles it.
+
+    Decoding of packets, filters, surfaces, selection, encoding. ``mev_s`` counts the events of both cameras.
+    """
+    packets = [encode(packet, 1) for packet in bench_input.large_packets(size.seconds, seed=1)]
+    events = sum(len(packet.x) for packet in bench_input.large_packets(size.seconds, seed=1))
+
+    def run() -> int:
+        stage = IngestStage(Settings(), bench_input.LARGE_RIG)
+        started_ns = time.perf_counter_ns()
+        for data in packets:
+            received: Any = decode(data).message
+            for message in stage.handle(received):
+                encode(message, 1)
+        return time.perf_counter_ns() - started_ns
+
+    return Case("ingest.hd", run, events=events, clocked=True)
 
 
 def _batch_packets(size: Size) -> Iterator[tuple[EventPacket, EventPacket]]:

@@ -18,6 +18,10 @@ from velod.types import F64, NS_PER_S, DepthBatch, EventPacket, FlowBatch, ImuPa
 CAMERA = Camera(width=346, height=260, fx=231.5, fy=231.5, cx=172.5, cy=129.5)
 RIG = Calibration(left=CAMERA, right=CAMERA, R_RL=np.eye(3), t_RL=np.array([-0.12, 0.0, 0.0]))
 
+LARGE_CAMERA = Camera(width=1280, height=720, fx=856.4, fy=856.4, cx=639.5, cy=359.5)
+LARGE_RIG = Calibration(left=LARGE_CAMERA, right=LARGE_CAMERA, R_RL=np.eye(3), t_RL=np.array([-0.12, 0.0, 0.0]))
+LARGE_SPEED_PX_S = 125.0
+
 SPEED_PX_S, SLANT, DISPARITY_PX = 500.0, 0.5, 8.0
 SPACING_PX = (12.0, 30.0)
 """Of neighbouring edges; irregular, as block matching could not tell even ones apart."""
@@ -28,7 +32,6 @@ IMU_NS = 5_000_000
 PACKET_NS = 5_000_000
 ACCEL_NOISE, GYRO_NOISE = 1.86e-2 * 200**0.5, 1.86e-3 * 200**0.5  # of one sample at 200 Hz
 _SCENE_SEED = 7  # both cameras see the same edges
-_RIGHTMOST_PX = CAMERA.width + SLANT * CAMERA.height + 64.0
 _UP = np.array([0.0, -9.81, 0.0])
 
 
@@ -42,20 +45,23 @@ class Columns:
     p: np.ndarray
 
 
-def events(seconds: float, shift_px: float, seed: int) -> Columns:
+def events(
+    seconds: float, shift_px: float, seed: int, camera: Camera = CAMERA, speed_px_s: float = SPEED_PX_S
+) -> Columns:
     """Slanted edges of alternating polarity that slide to the right; each passage of a pixel is a burst of two.
 
-    About 4.3 M events a second.
+    About 4.3 M events a second by default; as many more as there are pixels, and as they are faster.
     """
-    y, x = (c.ravel() for c in np.mgrid[: CAMERA.height, : CAMERA.width])
+    y, x = (c.ravel() for c in np.mgrid[: camera.height, : camera.width])
     # Edges lean one way above the middle and the other way below, so that their flows determine a velocity.
-    along_px = x + shift_px - np.where(y < CAMERA.height / 2, SLANT, -SLANT) * y
+    along_px = x + shift_px - np.where(y < camera.height / 2, SLANT, -SLANT) * y
     scene, noise = np.random.default_rng(_SCENE_SEED), np.random.default_rng(seed)
-    travelled_px = along_px.max() - along_px.min() + seconds * SPEED_PX_S
-    edges_px = _RIGHTMOST_PX - np.cumsum(scene.uniform(*SPACING_PX, int(2 * travelled_px / sum(SPACING_PX)) + 8))
+    travelled_px = along_px.max() - along_px.min() + seconds * speed_px_s
+    rightmost_px = camera.width + SLANT * camera.height + 64.0
+    edges_px = rightmost_px - np.cumsum(scene.uniform(*SPACING_PX, int(2 * travelled_px / sum(SPACING_PX)) + 8))
     t_ns, at, p = [], [], []
     for k, edge_px in enumerate(edges_px.tolist()):
-        t_s = (along_px - edge_px) / SPEED_PX_S
+        t_s = (along_px - edge_px) / speed_px_s
         seen = np.flatnonzero((t_s > 0.0) & (t_s < seconds))
         first_ns = np.round((t_s[seen] + noise.normal(0.0, JITTER_S, len(seen))) * 1e6).astype(np.int64) * 1000
         t_ns += [first_ns + j * BURST_NS for j in range(BURST)]
@@ -65,6 +71,18 @@ def events(seconds: float, shift_px: float, seed: int) -> Columns:
     kept = np.flatnonzero((t > 0) & (t < seconds * NS_PER_S))
     order = kept[np.argsort(t[kept], kind="stable")]
     return Columns(x[i[order]].astype(np.uint16), y[i[order]].astype(np.uint16), t[order], q[order])
+
+
+def large_packets(seconds: float, seed: int) -> Iterator[EventPacket]:
+    """Packets of both cameras of LARGE_RIG, every 5 ms: 22 M events a second."""
+    sides = {
+        camera: events(seconds, shift_px, seed, LARGE_CAMERA, LARGE_SPEED_PX_S)
+        for camera, shift_px in (("left", 0.0), ("right", DISPARITY_PX))
+    }
+    for seq in range(int(seconds * NS_PER_S) // PACKET_NS):
+        start, end = seq * PACKET_NS, (seq + 1) * PACKET_NS
+        for camera, e in sides.items():
+            yield _packet(seq, camera, e, start, end)
 
 
 def packets(seconds: float, seed: int) -> Iterator[EventPacket | ImuPacket]:
@@ -77,8 +95,12 @@ def packets(seconds: float, seed: int) -> Iterator[EventPacket | ImuPacket]:
         accel, gyro = _at_rest(len(sample_t_ns), rng)
         yield ImuPacket(seq, int(sample_t_ns[-1]), sample_t_ns, accel, gyro)
         for camera, e in sides.items():
-            part = slice(*np.searchsorted(e.t_ns, [start, end]).tolist())
-            yield EventPacket(seq, end, camera, e.x[part], e.y[part], e.t_ns[part], e.p[part])
+            yield _packet(seq, camera, e, start, end)
+
+
+def _packet(seq: int, camera: str, e: Columns, start_ns: int, end_ns: int) -> EventPacket:
+    part = slice(*np.searchsorted(e.t_ns, [start_ns, end_ns]).tolist())
+    return EventPacket(seq, end_ns, camera, e.x[part], e.y[part], e.t_ns[part], e.p[part])
 
 
 def record(path: Path, seconds: float, seed: int) -> int:

@@ -45,14 +45,26 @@ def age_unit_ns(memory_ns: int) -> int:
     return math.ceil(memory_ns / MAX_U16)
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _steps(stamp_ns: int, t_end_ns: int, memory_ns: int, unit_ns: float) -> np.uint16:
+    # In float64 because its division vectorises; the floor is exact for these integers.
+    age = np.int32(min(max(t_end_ns - stamp_ns, 0), memory_ns + 1))
+    steps = np.int32((np.float64(age) + (unit_ns - 1.0)) / unit_ns)
+    return np.uint16(steps) if age <= memory_ns else np.uint16(0)
+
+
 @njit(cache=True, nogil=True)
 def _encode_ages(stamp: I64, t_end_ns: int, memory_ns: int, unit_ns: int, out: U16) -> None:
     unit = np.float64(unit_ns)
     for i in range(stamp.size):
-        # In float64 because its division vectorises; the floor is exact for these integers.
-        age = np.int32(min(max(t_end_ns - stamp[i], 0), memory_ns + 1))
-        steps = np.int32((np.float64(age) + (unit - 1.0)) / unit)
-        out[i] = np.uint16(steps) if age <= memory_ns else np.uint16(0)
+        out[i] = _steps(stamp[i], t_end_ns, memory_ns, unit)
+
+
+@njit(cache=True, nogil=True)
+def _encode_newest(a: I64, b: I64, t_end_ns: int, memory_ns: int, unit_ns: int, out: U16) -> None:
+    unit = np.float64(unit_ns)
+    for i in range(a.size):
+        out[i] = _steps(max(a[i], b[i]), t_end_ns, memory_ns, unit)
 
 
 def encode_ages(stamp: I64, t_end_ns: int, memory_ns: int) -> U16:
@@ -63,6 +75,14 @@ def encode_ages(stamp: I64, t_end_ns: int, memory_ns: int) -> U16:
     """
     out = np.empty(stamp.shape, np.uint16)
     _encode_ages(stamp.reshape(-1), t_end_ns, memory_ns, age_unit_ns(memory_ns), out.reshape(-1))
+    return out
+
+
+def encode_newest(stamp: I64, t_end_ns: int, memory_ns: int) -> U16:
+    """``encode_ages`` of the newest stamp of either polarity, (h, w), for a surface (2, h, w)."""
+    out = np.empty(stamp.shape[1:], np.uint16)
+    off, on = stamp.reshape(2, -1)
+    _encode_newest(off, on, t_end_ns, memory_ns, age_unit_ns(memory_ns), out.reshape(-1))
     return out
 
 

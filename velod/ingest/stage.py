@@ -13,7 +13,7 @@ import numpy as np
 
 from velod.config import Settings
 from velod.events.plane_fit import SIZE
-from velod.events.sae import age_unit_ns, encode_ages, gather_patches, new_surface
+from velod.events.sae import age_unit_ns, encode_ages, encode_newest, gather_patches, new_surface
 from velod.events.selection import select_burst, select_paper
 from velod.events.sensor_size import for_sensor
 from velod.geometry.calibration import Calibration
@@ -183,14 +183,9 @@ class IngestStage:
         self._batch_t_ns = t_end_ns
         self.counters["batches"] += 1
         seq, memory_ns = self._batch_seq, self._memory_ns
-        left, right, left_last, right_last = (
-            encode_ages(stamp, t_end_ns, memory_ns)
-            for stamp in (
-                self._left.first,
-                self._right.first,
-                self._left.last.max(axis=0),
-                self._right.last.max(axis=0),
-            )
+        left, right = (encode_ages(camera.first, t_end_ns, memory_ns) for camera in (self._left, self._right))
+        left_last, right_last = (
+            encode_newest(camera.last, t_end_ns, memory_ns) for camera in (self._left, self._right)
         )
         event_batches: list[EventBatch]
         if self._slices is None:

@@ -13,6 +13,7 @@ from itertools import pairwise
 import numpy as np
 
 from velod.config import Settings
+from velod.events.sensor_size import for_sensor
 from velod.geometry.calibration import Calibration
 from velod.optimizer.attitude import Attitude
 from velod.optimizer.calibration_check import CalibrationCheck
@@ -45,7 +46,7 @@ class OptimizerStage:
         self._hz = settings.optimizer.output_hz
         wait = settings.optimizer.max_wait_ms
         self._max_wait_ns = int(wait * 1e6) if np.isfinite(wait) else None
-        ingest = settings.ingest
+        ingest = for_sensor(settings, calibration.left.width, calibration.left.height).ingest
         self._silence_ns = None if ingest.batch == "count" else round(ingest.period_ms * 1e6)
         self.counters: dict[str, int] = {}
         self._check = CalibrationCheck(settings.optimizer)
