@@ -75,9 +75,21 @@ REST = Motion(np.zeros(3), np.zeros(3), np.zeros(3), np.ones(3))
 
 @cache
 def messages(
-    motion, seconds, seed=0, flows=250, period_s=0.015, imu_hz=200, noise=1.0, outliers=0.03, dark=(9.0, 9.0)
+    motion,
+    seconds,
+    seed=0,
+    flows=250,
+    period_s=0.015,
+    imu_hz=200,
+    noise=1.0,
+    outliers=0.03,
+    dark=(9.0, 9.0),
+    upright_s=(99.0, 99.0),
 ):
-    """ImuSamples, FlowBatch and DepthBatch in the order in which they would arrive; no flows within ``dark`` s."""
+    """ImuSamples, FlowBatch and DepthBatch in the order in which they would arrive.
+
+    No flows within ``dark`` s; none but of edges along the image's columns within ``upright_s``.
+    """
     rng = np.random.default_rng(seed)
     imu_t = np.arange(int((seconds + 0.1) * imu_hz) + 1) / imu_hz
     accel = (
@@ -100,18 +112,19 @@ def messages(
         )
         sent = upto
         m = 0 if dark[0] < end_ns * 1e-9 <= dark[1] else flows
-        out += _front_end(motion, rng, seq, end_ns, int(period_s * 1e9), m, noise, outliers)
+        upright = upright_s[0] < end_ns * 1e-9 <= upright_s[1]
+        out += _front_end(motion, rng, seq, end_ns, int(period_s * 1e9), m, noise, outliers, upright)
     return tuple(out)
 
 
-def _front_end(motion, rng, seq, end_ns, period_ns, m, noise, outliers):
+def _front_end(motion, rng, seq, end_ns, period_ns, m, noise, outliers, upright):
     age = rng.integers(1, period_ns, m)
     v = np.array([motion.v_B((end_ns - a) * 1e-9) for a in age]).reshape(-1, 3)
     omega = np.array([motion.omega_B((end_ns - a) * 1e-9) for a in age]).reshape(-1, 3)
     x, y, Z = rng.uniform(10, 336, m), rng.uniform(10, 250, m), rng.uniform(1.5, 6.0, m)
     u, w, f = x - CAMERA.cx, y - CAMERA.cy, CAMERA.fx
     flow = np.einsum("mij,mj->mi", A_v(u, w, f), v) / Z[:, None] + np.einsum("mij,mj->mi", B_w(u, w, f), omega)
-    angle = rng.uniform(0, 2 * np.pi, m)
+    angle = np.zeros(m) if upright else rng.uniform(0, 2 * np.pi, m)
     n = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     n *= np.sign(np.sum(flow * n, axis=1))[:, None]
     true_speed = np.sum(flow * n, axis=1)
@@ -119,6 +132,10 @@ def _front_end(motion, rng, seq, end_ns, period_ns, m, noise, outliers):
     speed = np.maximum(true_speed + rng.normal(size=m) * sigma * noise, 1e-3)
     bad = rng.random(m) < outliers
     speed[bad] *= rng.uniform(0.3, 2.0, int(bad.sum()))
+    if upright:
+        # the plane's slope errs across the edge's normal as much as along it
+        error = rng.normal(size=m) * sigma / np.maximum(true_speed, 10.0) * noise
+        n = np.stack([n[:, 0] * np.cos(error), n[:, 0] * np.sin(error)], axis=1)
     fb = f * BASELINE_M
     sigma_inv = np.full(m, 0.06 / fb)
     inv_depth = 1 / Z + rng.normal(size=m) * sigma_inv * noise

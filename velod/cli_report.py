@@ -23,7 +23,7 @@ CSV_COLUMNS = (
     *("t_ns", "vx", "vy", "vz"),
     *("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz"),
     *("state", "valid", "age_ms"),
-    *("bridged_ms", "up_x", "up_y", "up_z", "up_sigma", "frame"),
+    *("bridged_ms", "up_x", "up_y", "up_z", "up_sigma", "frame", "degenerate"),
 )
 """Velocity in m/s in B, covariance in (m/s)^2, up in B with the larger sigma of its direction in rad; age_ms: from
 sensor time to publication; bridged_ms: how far the IMU carried the newest measurement."""
@@ -41,7 +41,7 @@ def write_csv(path: str, velocities: Sequence[Velocity]) -> None:
             bridged_ms = math.nan if v.batch_seq < 0 else (v.t_ns - v.batch_t_ns) / 1e6
             further = [_number(a) for a in (v.age_ms, bridged_ms, *v.up_B, up_sigma(v))]
             numbers = [repr(float(a)) for a in (*v.v_B, *v.cov[_UPPER])]
-            writer.writerow([v.t_ns, *numbers, v.state, int(v.valid), *further, v.frame])
+            writer.writerow([v.t_ns, *numbers, v.state, int(v.valid), *further, v.frame, v.degenerate])
 
 
 def _number(a: float) -> str:

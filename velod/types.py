@@ -194,6 +194,8 @@ class Velocity:
     up_B: F64 = field(default_factory=lambda: np.full(3, np.nan))  # (3,) unit vector against gravity, frame B
     up_cov: F64 = field(default_factory=lambda: np.full((3, 3), np.nan))  # (3, 3) of up_B, rad^2, rank 2
     frame: str = "imu"  # what B is: "imu", "camera", or the name of a frame from the settings
+    degenerate: int = 0  # directions of v_B that the last flows say nothing of ...
+    degenerate_B: F64 = field(default_factory=lambda: np.zeros((3, 3)))  # ... unit vectors in the first rows, frame B
 
 
 @dataclass(frozen=True, slots=True)

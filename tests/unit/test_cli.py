@@ -29,7 +29,7 @@ EVAL_KEYS = [
 ]
 CSV_HEADER = (
     "t_ns,vx,vy,vz,cov_xx,cov_xy,cov_xz,cov_yy,cov_yz,cov_zz,state,valid,age_ms,"
-    "bridged_ms,up_x,up_y,up_z,up_sigma,frame"
+    "bridged_ms,up_x,up_y,up_z,up_sigma,frame,degenerate"
 )
 
 

@@ -168,7 +168,7 @@ def test_a_field_that_a_later_version_adds_is_ignored() -> None:
 
 
 def test_a_field_that_an_earlier_velod_did_not_send_has_its_default() -> None:
-    added = ("age_ms", "up_B", "up_cov", "frame")
+    added = ("age_ms", "up_B", "up_cov", "frame", "degenerate", "degenerate_B")
     sent = velocity(age_ms=3.0, up_B=np.ones(3), up_cov=np.eye(3), frame="camera")
     message = decode(altered(sent, lambda m: [m.pop(name) for name in added])).message
     assert isinstance(message, Velocity)

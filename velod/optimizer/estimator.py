@@ -11,10 +11,10 @@ from velod.config import Settings
 from velod.geometry.calibration import Calibration
 from velod.geometry.rectify import rectify
 from velod.geometry.so3 import hat, log
-from velod.optimizer import attitude, flow_equation, inertial_residual
+from velod.optimizer import attitude, degeneracy, flow_equation, inertial_residual
 from velod.optimizer.attitude import Attitude
 from velod.optimizer.consistency import Consistency
-from velod.optimizer.flow_equation import BIN_NS, Bins, Fit, Measured, Rows
+from velod.optimizer.flow_equation import BIN_NS, RIDGE, Bins, Fit, Measured, Rows
 from velod.optimizer.inertial import InertialMemory
 from velod.optimizer.interval import Interval
 from velod.optimizer.preintegration import Preintegration, preintegrate
@@ -77,6 +77,7 @@ class Equations:
     on_error: Rows
     measured: Measured
     common: F64  # (m, 3), flow_equation.COMMON
+    across: F64  # (m, 3) the rows on e of normals turned by a right angle
 
 
 class Estimator:
@@ -113,6 +114,7 @@ class Estimator:
         self._started_ns = 0
         self._depth_m = USUAL_DEPTH  # median of the newest batch
         self._still_to = 0  # up to here rest has been observed
+        self._weak_L: F64 = np.empty((0, 3))  # directions that the newest batch with flow does not constrain
         self.lacking = "no events"  # why the newest batch gave no velocity
         # t_ns -> the IMU up to there and the prediction, from the head ``_carried_from``
         self._carried: dict[int, tuple[Preintegration, F64, F64]] = {}
@@ -211,6 +213,13 @@ class Estimator:
             self._carried[t_ns] = (p, *inertial_residual.carry(p, head.v_B, head.R_LB, head.g_L, head.cov))
         return self._carried[t_ns]
 
+    def degenerate(self, t_ns: int) -> F64:
+        """Directions (k, 3) in B at ``t_ns`` of which the last flows say nothing; unit vectors."""
+        head = self.head
+        if head is None or not self.memory.covers(head.t_ns, t_ns):
+            return np.empty((0, 3))
+        return self._weak_L @ head.R_LB @ self._carry(head, t_ns)[0].R_gamma
+
     @property
     def dark(self) -> bool:
         """Whether the sensor moves and sees nothing."""
@@ -269,9 +278,9 @@ class Estimator:
             return None
         inv_depth = depth.inv_depth[at_depth]
         self._depth_m = 1.0 / max(float(np.median(inv_depth)), 1e-3)
-        a_B, b_B = flow_equation.body_rows(
-            (flow.x[at_flow], flow.y[at_flow]), flow.n[at_flow], inv_depth, self._camera, self._R_CB, self._p_BC_B
-        )
+        n = flow.n[at_flow]
+        where = ((flow.x[at_flow], flow.y[at_flow]), n, inv_depth, self._camera, self._R_CB, self._p_BC_B)
+        a_B, b_B = flow_equation.body_rows(*where)
         R_LB, s_L, w_B = self.memory.at(t)
         # Eq. 4: |x_n| - n^T B w = (n^T A / Z) v
         speed = flow.speed[at_flow].astype(np.float64)
@@ -281,7 +290,9 @@ class Estimator:
         )
         on_error = flow_equation.on_error(on_velocity, R_LB, s_L)
         common = self._common(on_velocity, on_error, measured)
-        return Equations(on_error if self._o.spline == "error" else on_velocity, on_error, measured, common)
+        across_B, _ = flow_equation.body_rows(where[0], np.stack([-n[:, 1], n[:, 0]], axis=1), *where[2:])
+        across = flow_equation.on_error(replace(on_velocity, a=across_B), R_LB, s_L).a
+        return Equations(on_error if self._o.spline == "error" else on_velocity, on_error, measured, common, across)
 
     def _e(self, t_ns: I64, head: Head) -> F64:
         """e (m, 3) at ``t_ns`` (m,), from the head on along the slope of gravity."""
@@ -297,13 +308,18 @@ class Estimator:
         on_error, measured = equations.on_error, equations.measured
         dt = (on_error.t_ns - t_ns) * 1e-9
         still = replace(on_error, z=on_error.z + (on_error.a @ self._gravity()) * dt)
+        predicted_e = np.zeros(3)
         if self.head is not None:
-            still.z[:] -= equations.common @ self.head.common
+            # from the prediction on, so that a direction that no flow sees stays there
+            predicted_e = self._e(np.array([t_ns]), self.head)[0]
+            still.z[:] -= equations.common @ self.head.common + on_error.a @ predicted_e
         iterations, seed = self._o.ransac_iterations, self._o.seed + t_ns // 1000
         if self._o.weights == "fixed":
             still.sigma[:] = self._o.fixed_sigma_px_s
-            return flow_equation.solve(still, iterations, seed)
-        return flow_equation.solve_weighted(still, measured, iterations, seed)
+            fit = flow_equation.solve(still, iterations, seed, RIDGE)
+        else:
+            fit = flow_equation.solve_weighted(still, measured, iterations, seed, RIDGE)
+        return None if fit is None else replace(fit, e=fit.e + predicted_e)
 
     def _start(self, t_ns: int) -> None:
         self.window.start(t_ns)
@@ -364,16 +380,22 @@ class Estimator:
             self._count("fit.undetermined")
             self.lacking = "the flows do not determine a velocity"
             return
-        self.own_solution = (t_ns, self.memory.at(np.array([t_ns]))[1][0], fit.e)
+        weak_L = degeneracy.open_directions(equations.on_error, equations.measured, equations.across, fit)
+        self._weak_L = weak_L
+        self.own_solution = None if len(weak_L) else (t_ns, self.memory.at(np.array([t_ns]))[1][0], fit.e)
         shared = self._o.shared_error
         if predicted is not None:
-            innovation = self._innovation(t_ns, fit, predicted)
+            innovation = self._innovation(t_ns, fit, predicted, weak_L)
             self.consistency.note(innovation)
             shared *= max(1.0, innovation / INNOVATION_GATE)
         if shared > self._o.shared_error:
             self._count("fit.inconsistent")
-        rows, common = equations.on_spline, equations.common
-        self._share_out(flow_equation.compress(rows, common, fit, shared))
+        bins = flow_equation.compress(equations.on_spline, equations.common, fit, shared)
+        if len(weak_L):
+            self._count("fit.degenerate")
+            R_LB, _, _ = self._frame(t_ns)
+            degeneracy.without(bins.L, bins.eta, weak_L if self._o.spline == "error" else weak_L @ R_LB)
+        self._share_out(bins)
         self.batches += 1
         self.last_usable_t_ns = max(self.last_usable_t_ns, t_ns)
 
@@ -399,6 +421,7 @@ class Estimator:
             J = self.window.selector(t_ns)[6:9]
             self.window.add(J, gyro.mean(axis=0), np.eye(3) * information)
         self._still_to = t_ns
+        self._weak_L = np.empty((0, 3))
         self._count("standstill")
         self.batches += 1
         self.last_usable_t_ns = t_ns
@@ -406,12 +429,18 @@ class Estimator:
     def _still_sigma(self) -> float:
         return self._standstill.sigma(self._depth_m / self._camera[0])
 
-    def _innovation(self, t_ns: int, fit: Fit, predicted: tuple[F64, F64]) -> float:
-        """Squared Mahalanobis distance of the batch's own velocity from the predicted one."""
+    def _innovation(self, t_ns: int, fit: Fit, predicted: tuple[F64, F64], weak_L: F64) -> float:
+        """Squared Mahalanobis distance of the batch's own velocity from the predicted one, as of three dimensions.
+
+        The directions ``weak_L`` (k, 3), which the batch does not determine, do not count.
+        """
+        seen = degeneracy.complement(weak_L)
+        if not len(seen):
+            return 3.0
         R, s_L, _ = self.memory.at(np.array([t_ns]))
-        d = R[0].T @ (s_L[0] + fit.e) - predicted[0]
-        S = R[0].T @ fit.cov @ R[0] * self._o.shared_error + predicted[1]
-        return float(d @ np.linalg.solve(S, d))
+        d = seen @ (s_L[0] + fit.e - R[0] @ predicted[0])
+        S = seen @ (fit.cov * self._o.shared_error + R[0] @ predicted[1] @ R[0].T) @ seen.T
+        return float(d @ np.linalg.solve(S, d)) * 3.0 / len(seen)
 
     def _keep_error_small(self) -> None:
         """Take from s_L what gravity has added to it, before the solution loses digits to it."""

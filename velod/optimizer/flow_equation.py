@@ -21,6 +21,8 @@ from velod.types import F32, F64, I64, U16
 
 BIN_NS = 5_000_000
 """Flows this close in time share one gyroscope noise (DESIGN 5, item 6)."""
+RIDGE = 1e-8
+"""Of the trace of normal equations, on their diagonal: too little for what any flow has seen to feel it."""
 PREDICTED_SHARE = (0.3, 3.0)
 """Bounds on predicted over measured flow where a sigma is scaled by it."""
 COMMON = ("flow scale", "delay", "depth scale")
@@ -152,29 +154,29 @@ def pairs(flow_index: U16, depth_index: U16) -> tuple[I64, I64]:
     return at_flow[:n], at_depth[:n]
 
 
-def solve(rows: Rows, iterations: int, seed: int) -> Fit | None:
+def solve(rows: Rows, iterations: int, seed: int, ridge: float = 0.0) -> Fit | None:
     """RANSAC on minimal samples of three rows, then five rounds of redescending least squares (Eq. 15 / Z).
 
-    Returns None where the rows do not determine a velocity.
+    Returns None where the rows do not determine a velocity; with a ``ridge`` (RIDGE), e is 0 where they do not.
     """
     m = len(rows.z)
     weight, e, cov, stats = np.zeros(m), np.zeros(3), np.zeros((3, 3)), np.zeros(2)
-    if m < 3 or not _solve(rows.a, rows.z, rows.sigma, iterations, seed & 0x7FFFFFFF, weight, e, cov, stats):
+    if m < 3 or not _solve(rows.a, rows.z, rows.sigma, iterations, seed & 0x7FFFFFFF, ridge, weight, e, cov, stats):
         return None
     return Fit(e, cov, weight, float(stats[0]), float(stats[1]))
 
 
-def solve_weighted(rows: Rows, measured: Measured, iterations: int, seed: int) -> Fit | None:
+def solve_weighted(rows: Rows, measured: Measured, iterations: int, seed: int, ridge: float = 0.0) -> Fit | None:
     """``solve`` with the sigmas of ``measured``, then with those of the flow that the first solution predicts.
 
     The sigmas are set in ``rows``, in place.
     """
     rows.sigma[:] = sigmas(measured, np.zeros_like(rows.z))
-    first = solve(rows, iterations, seed)
+    first = solve(rows, iterations, seed, ridge)
     if first is None:
         return None
     rows.sigma[:] = sigmas(measured, rows.z - rows.a @ first.e)
-    return solve(rows, iterations, seed)
+    return solve(rows, iterations, seed, ridge)
 
 
 def compress(rows: Rows, c: F64, fit: Fit, shared_error: float) -> Bins:
@@ -283,7 +285,15 @@ def _solve3(H, g, x):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _normal_equations(a, z, sigma, weight, H, g):  # type: ignore[no-untyped-def]
+def _regularise(H, ridge):  # type: ignore[no-untyped-def]
+    """Add ``ridge`` times the trace to the diagonal: a direction that no row sees keeps the value zero."""
+    added = ridge * (H[0, 0] + H[1, 1] + H[2, 2])
+    for i in range(3):
+        H[i, i] += added
+
+
+@njit(cache=True, nogil=True)
+def _normal_equations(a, z, sigma, weight, ridge, H, g):  # type: ignore[no-untyped-def]
     H[:, :] = 0.0
     g[:] = 0.0
     for k in range(len(z)):
@@ -294,10 +304,11 @@ def _normal_equations(a, z, sigma, weight, H, g):  # type: ignore[no-untyped-def
                 g[i] += wi * z[k]
                 for j in range(3):
                     H[i, j] += wi * a[k, j]
+    _regularise(H, ridge)
 
 
 @njit(cache=True, nogil=True)
-def _ransac(a, z, sigma, iterations, seed, best, H, g):  # type: ignore[no-untyped-def]
+def _ransac(a, z, sigma, iterations, seed, ridge, best, H, g):  # type: ignore[no-untyped-def]
     """Minimal samples of Eq. 15; the truncated squared residual decides (MSAC, 3 sigma). False: none was regular."""
     m = len(z)
     x = np.empty(3)
@@ -313,6 +324,7 @@ def _ransac(a, z, sigma, iterations, seed, best, H, g):  # type: ignore[no-untyp
                 g[i] += a[k, i] * z[k]
                 for j in range(3):
                     H[i, j] += a[k, i] * a[k, j]
+        _regularise(H, ridge)
         if not _solve3(H, g, x):
             continue
         cost = 0.0
@@ -328,10 +340,10 @@ def _ransac(a, z, sigma, iterations, seed, best, H, g):  # type: ignore[no-untyp
 
 
 @njit(cache=True, nogil=True)
-def _solve(a, z, sigma, iterations, seed, weight, e, cov, stats):  # type: ignore[no-untyped-def]
+def _solve(a, z, sigma, iterations, seed, ridge, weight, e, cov, stats):  # type: ignore[no-untyped-def]
     m = len(z)
     H, g, r = np.empty((3, 3)), np.empty(3), np.empty(m)
-    if not _ransac(a, z, sigma, iterations, seed, e, H, g):
+    if not _ransac(a, z, sigma, iterations, seed, ridge, e, H, g):
         return False
     scale = 1.0
     for _ in range(5):
@@ -341,7 +353,7 @@ def _solve(a, z, sigma, iterations, seed, weight, e, cov, stats):  # type: ignor
         for k in range(m):
             u = r[k] / (4.685 * scale)  # Tukey's biweight, 95 % efficient
             weight[k] = (1.0 - u * u) ** 2 if abs(u) < 1.0 else 0.0
-        _normal_equations(a, z, sigma, weight, H, g)
+        _normal_equations(a, z, sigma, weight, ridge, H, g)
         if not _solve3(H, g, e):
             return False
     column, unit = np.empty(3), np.zeros(3)

@@ -20,7 +20,7 @@ from velod.optimizer.calibration_check import CalibrationCheck
 from velod.optimizer.dead_reckoning import DeadReckoning
 from velod.optimizer.estimator import Estimator
 from velod.optimizer.parts import Parts, batch_seq
-from velod.types import NS_PER_S, DepthBatch, FlowBatch, ImuSamples, Odometry, TrackingState, Velocity
+from velod.types import F64, NS_PER_S, DepthBatch, FlowBatch, ImuSamples, Odometry, TrackingState, Velocity
 
 UNKNOWN_SIGMA = 100.0
 """Of a velocity nothing is known about, m/s."""
@@ -270,14 +270,19 @@ class OptimizerStage:
             v, cov = np.zeros(3), np.eye(3) * UNKNOWN_SIGMA**2
         else:
             v, cov = predicted
-        state, reason, valid = self._judge(tau, v, cov)
+        weak_B = self._estimator.degenerate(tau)
+        state, reason, valid = self._judge(tau, v, cov, weak_B)
         velocity = Velocity(
             self._seq, tau, v, cov, valid, state, reason, *self._newest, age_ms=(self._now_ns - tau) * 1e-6
         )
+        if len(weak_B):
+            velocity = replace(
+                velocity, degenerate=len(weak_B), degenerate_B=np.vstack([weak_B, np.zeros((3, 3))])[:3]
+            )
         self._seq += 1
         return velocity if attitude is None else replace(velocity, up_B=attitude.up_B, up_cov=attitude.up_cov)
 
-    def _judge(self, tau: int, v: np.ndarray, cov: np.ndarray) -> tuple[str, str, bool]:
+    def _judge(self, tau: int, v: F64, cov: F64, weak_B: F64) -> tuple[str, str, bool]:
         """State, reason and validity of an estimate."""
         sigma = float(np.sqrt(np.linalg.eigvalsh(cov)[-1]))
         limit = VALID_SIGMA + VALID_SHARE * float(np.linalg.norm(v))
@@ -299,6 +304,9 @@ class OptimizerStage:
             return TrackingState.DEGRADED, without_flow, True
         if disagreement:
             return TrackingState.DEGRADED, disagreement, True
+        if len(weak_B):
+            along = ", ".join("[{:+.2f} {:+.2f} {:+.2f}]".format(*direction) for direction in weak_B)
+            return TrackingState.DEGRADED, f"degenerate: the flows say nothing along {along}", True
         return TrackingState.TRACKING, "", True
 
     def _uncertain(self, tau: int, sigma: float) -> str:

@@ -1,0 +1,78 @@
+"""Directions of the velocity that the flows do not constrain: parallel edges, edges on one line, edges all too far.
+
+A normal flow says nothing of the motion along its edge. Where all edges are parallel, the equations of a batch seem
+to determine that direction nevertheless, because the measured normals scatter: an error of a normal lets in a share
+of the row across it. What a direction has of information is therefore compared with what that scatter makes of none.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from velod.optimizer.flow_equation import Fit, Measured, Rows
+from velod.types import F64
+
+TRUSTED = 3.0
+"""Information over that of scattering normals, below which a direction is not believed. Without any signal it is 1;
+in sound recordings the weakest direction has 20 to 500, with few flows and motion along one axis 4."""
+MAX_DIRECTION_SIGMA = 0.3
+"""rad; a flow slower than a few of its sigmas has no direction to speak of."""
+MIN_TOLD = 6
+"""Flows with a direction, below which there is no telling."""
+SINGULAR = 1e-6
+"""Of the mean information: what counts as none where the normals do not scatter."""
+
+
+def open_directions(on_error: Rows, measured: Measured, across: F64, fit: Fit) -> F64:
+    """Unit vectors (k, 3) in L of what a batch says nothing of, from its rows and those ``across`` (m, 3)."""
+    # the plane's slope errs across as much as along
+    direction_sigma = measured.sigma / measured.speed
+    told = direction_sigma < MAX_DIRECTION_SIGMA
+    if np.count_nonzero(told) < MIN_TOLD:
+        # almost at rest: small flows say that the velocity is small, whichever way they point
+        return np.empty((0, 3))
+    weight = fit.weight / on_error.sigma**2
+    return weak_directions(*information(on_error.a[told], across[told], direction_sigma[told], weight[told]))
+
+
+def information(a: F64, across: F64, direction_sigma: F64, weight: F64) -> tuple[F64, F64]:
+    """What rows say of the velocity, (3, 3), and what they would seem to say if their normals only scattered.
+
+    ``a`` (m, 3): n^T A / Z; ``across`` (m, 3): the same for n turned by a right angle; ``direction_sigma`` (m,):
+    of n, rad; ``weight`` (m,): over the variance of the row.
+    """
+    said = (a * weight[:, None]).T @ a
+    scatter = (across * (weight * direction_sigma**2)[:, None]).T @ across
+    return said, scatter
+
+
+def weak_directions(said: F64, scatter: F64) -> F64:
+    """Unit vectors (k, 3) of the directions in which ``said`` is no more than ``scatter`` explains; orthonormal."""
+    floor = SINGULAR * float(np.trace(said)) / 3.0
+    if floor <= 0.0:
+        return np.eye(3)
+    # generalised eigenvalues of (said, scatter): whiten by scatter
+    root = np.linalg.cholesky(scatter + floor * np.eye(3))
+    half = np.linalg.solve(root, said)
+    ratio, vectors = np.linalg.eigh(np.linalg.solve(root, half.T))
+    weak = np.linalg.solve(root.T, vectors[:, ratio < TRUSTED])
+    return np.ascontiguousarray(np.linalg.qr(weak)[0].T)
+
+
+def complement(directions: F64) -> F64:
+    """Orthonormal rows (3 - k, 3) across orthonormal ``directions`` (k, 3)."""
+    return np.asarray(np.linalg.svd(np.vstack([directions, np.zeros((1, 3))]))[2][len(directions) :])
+
+
+def without(L: F64, eta: F64, directions: F64) -> None:
+    """Take from informations L (n, s, s), eta (n, s) what they say of the first states along ``directions`` (k, 3).
+
+    All of it, in place. It is as if an unknown offset along them were added to those states.
+    """
+    U = np.zeros((L.shape[1], len(directions)))
+    U[:3] = directions.T
+    for Lk, eta_k in zip(L, eta, strict=True):
+        LU = Lk @ U
+        inner = np.linalg.pinv(U.T @ LU, hermitian=True)
+        eta_k -= LU @ (inner @ (U.T @ eta_k))
+        Lk -= LU @ inner @ LU.T
