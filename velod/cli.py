@@ -519,7 +519,9 @@ def _add_prove(commands: _Commands[argparse.ArgumentParser]) -> None:
         epilog="""\
 examples:
   velod prove attacks                no certificate, forged velocity, floods, garbage, ...
-  velod prove fuzz --runs 10000000   bad inputs for every decoder, in half an hour""",
+  velod prove fuzz --runs 10000000   bad inputs for every decoder, in half an hour
+  velod prove fleet --rigs 200       velocities of so many rigs through one router
+  velod prove soak --seconds 120     two minutes of faults; half an hour without the option""",
     )
     actions = parser.add_subparsers(title="trials", metavar="TRIAL", required=True)
 

@@ -19,7 +19,19 @@ def add_actions(actions: Any) -> None:
     fuzz.add_argument("--seed", type=int, default=1, help="of the inputs (default 1)")
     fuzz.add_argument("--corpus", metavar="DIR", help="where to begin from, and to keep inputs that were of interest")
     fuzz.set_defaults(command=_fuzz)
-    for parser in (attacks, fuzz):
+    fleet = actions("fleet", "many simulated rigs through one router to one consumer: rate, latency, CPU")
+    fleet.add_argument("--rigs", type=int, default=100, help="how many (default 100)")
+    fleet.add_argument("--hz", type=float, default=75.0, help="velocities per second of each (default 75)")
+    fleet.add_argument("--seconds", type=float, default=10.0, help="default 10")
+    fleet.set_defaults(command=_fleet)
+    soak = actions(
+        "soak", "a velod at work for long, its workers killed and stopped at random: memory, files, latency"
+    )
+    soak.add_argument("--seconds", type=float, default=1800.0, help="default 1800")
+    soak.add_argument("--fault-every", type=float, default=20.0, metavar="S", help="on average (default 20)")
+    soak.add_argument("--seed", type=int, default=1, help="of the faults (default 1)")
+    soak.set_defaults(command=_soak)
+    for parser in (attacks, fuzz, fleet, soak):
         parser.add_argument("--json", metavar="OUT", help="write what was seen; - for stdout")
 
 
@@ -74,4 +86,63 @@ def _fuzz(args: argparse.Namespace) -> int:
         write_json(args.json, [asdict(result) for result in results])
     if crashes := [f"{r.decoder}: {r.crash}" for r in results if r.crash]:
         raise RunFailed("; ".join(crashes))
+    return 0
+
+
+def _fleet(args: argparse.Namespace) -> int:
+    """Raises RunFailed where more than a hundredth of the velocities did not come."""
+    from velod.cli_report import write_json
+    from velod.prove.fleet import FleetError, run_fleet
+
+    try:
+        fleet = run_fleet(args.rigs, args.hz, args.seconds)
+    except FleetError as e:
+        raise RunFailed(str(e)) from None
+    print(
+        f"{fleet.rigs} rigs at {fleet.hz:g} Hz: {fleet.rate_hz:.0f} velocities per second at the consumer"
+        f" ({100 * fleet.share:.1f} %), {fleet.lost} lost, {fleet.silent} rigs not heard; latency p50"
+        f" {fleet.latency_p50_ms:.2f} ms, p99 {fleet.latency_p99_ms:.2f} ms; cores: router {fleet.router_cores:.2f},"
+        f" consumer {fleet.consumer_cores:.2f}, all rigs {fleet.rigs_cores:.2f}; router {fleet.router_mib:.0f} MiB",
+        file=sys.stderr if args.json == "-" else sys.stdout,
+    )
+    if args.json is not None:
+        write_json(args.json, asdict(fleet))
+    if fleet.share < 0.99:
+        raise RunFailed(f"{100 * fleet.share:.1f} % of the velocities came")
+    return 0
+
+
+def _soak(args: argparse.Namespace) -> int:
+    """Raises RunFailed where memory, files or latency grow."""
+    from velod.cli_report import write_json
+    from velod.prove.besieged import SiegeError
+    from velod.prove.soak import soak
+    from velod.sim import simulated_recording
+
+    def say(line: str) -> None:
+        print(line, file=sys.stderr, flush=True)
+
+    try:
+        recording = simulated_recording("corridor-1", 5.0, seed=1)
+        result = soak(recording, args.seconds, args.fault_every, args.seed, say)
+    except SiegeError as e:
+        raise RunFailed(str(e)) from None
+    out = sys.stderr if args.json == "-" else sys.stdout
+    hits = ", ".join(f"{fault} {n} times" for fault, n in sorted(result.faults.items()))
+    print(
+        f"{result.seconds:.0f} s; faults: {hits or 'none'}; {result.served} valid velocities,"
+        f" at the most {result.longest_gap_s:.2f} s apart; latency {result.latency_middle_ms:.1f} ms in the middle,"
+        f" {result.latency_last_ms:.1f} ms in the end",
+        file=out,
+    )
+    for p in result.processes:
+        print(
+            f"{p.worker:<14} {p.seconds:6.0f} s  {p.mib:6.1f} MiB, {p.growth_mib:+.2f} in the last quarter,"
+            f" {p.slope_mib_h:+.2f} MiB/h; {p.files} files, {p.new_files:+d}",
+            file=out,
+        )
+    if args.json is not None:
+        write_json(args.json, asdict(result))
+    if failures := result.failures():
+        raise RunFailed("; ".join(failures))
     return 0

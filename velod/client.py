@@ -17,6 +17,7 @@ from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
+import zenoh
 
 from velod.config import ZenohSettings
 from velod.runtime.access import may_read
@@ -93,17 +94,21 @@ class Listener:
 
     def _subscribe(self, topic: Topic) -> Any:
         # A queue for each rig: a hundred rigs must not push each other's newest messages out of one.
-        sources: dict[str, str] = {}
+        sources: dict[str, str] = {}  # by key
 
         def arrived(sample: Any) -> None:
             at = str(sample.key_expr)
-            rig = parts(topic, at)["rig"]
-            if (source := sources.get(rig)) is None:
-                source = sources[rig] = topic.name if self._rig != ANY_RIG else f"{topic.name}{_OF}{rig}"
-                self._inbox.add_source(source, topic.qos.depth)
+            if (source := sources.get(at)) is None:
+                rig = parts(topic, at)["rig"]
+                source = topic.name if self._rig != ANY_RIG else f"{topic.name}{_OF}{rig}"
+                if source not in sources.values():
+                    self._inbox.add_source(source, topic.qos.depth)
+                sources[at] = source
             self._inbox.put(source, at, sample.payload.to_bytes())
 
-        return self._session.declare_subscriber(key(topic, self._rig), arrived)
+        # "indirect" would hand each sample to one more thread; the inbox is hand-over enough.
+        callback = zenoh.handlers.Callback(arrived, indirect=False)
+        return self._session.declare_subscriber(key(topic, self._rig), callback)
 
     def receive(self, timeout_s: float = math.inf) -> Received | None:
         """The next message that can be read; None after ``timeout_s`` without one."""

@@ -19,6 +19,7 @@ import numpy as np
 import zenoh
 
 from velod.prove.besieged import OTHER_RIG, RIG, STAGES, Besieged
+from velod.prove.processes import resident_mib
 from velod.runtime.certificates import Authority, new_authority, new_certificate, read_authority, write_pair
 from velod.runtime.endpoints import parse
 from velod.runtime.key_paths import KeyPaths
@@ -306,12 +307,3 @@ def _resident_mib(target: Besieged) -> dict[str, float]:
     """Of the workers and of the process that faces the network."""
     pids = {w: pid for w, pid in target.process_ids().items() if w in (*STAGES, "supervisor")}
     return {worker: resident_mib(pid) for worker, pid in pids.items()}
-
-
-def resident_mib(pid: int) -> float:
-    """Resident memory of a process without what it shares, MiB (Linux); 0 for one that is gone."""
-    try:
-        _, resident, shared = Path(f"/proc/{pid}/statm").read_text().split()[:3]
-    except FileNotFoundError:
-        return 0.0
-    return (int(resident) - int(shared)) * os.sysconf("SC_PAGE_SIZE") / _MIB

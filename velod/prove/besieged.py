@@ -53,7 +53,7 @@ class Besieged:
         self._stop = Event()
         self.port, self.tls_port = free_port(), free_port()
         self.keys = Path()
-        self.service_pid = 0
+        self.driver_pid = 0
 
     def __enter__(self) -> Self:
         """Raises SiegeError."""
@@ -61,14 +61,15 @@ class Besieged:
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="velod-siege-")))
             self.keys = folder / "keys"
             make_keys(self.keys, rigs=(RIG, OTHER_RIG))
-            self.service_pid = self._start(stack, ["velod.cli", "run", "-c", str(self._settings(folder))])
+            self._start(stack, ["velod.cli", "run", "-c", str(self._settings(folder))])
             here = ZenohSettings(connect=f"tcp/127.0.0.1:{self.port}")
             self._watch(stack, Listener(RIG, (HEALTH,), here), self._note_health)
             self.wait_until(lambda: set(STAGES) <= set(self._health), START_S, "the service is not up")
             self.insider = stack.enter_context(open_session(here))
             # At another speed than 1 the sensor's time says nothing of age.
             self._watch(stack, VelocityClient(RIG, self.endpoint, math.inf, keys=str(self.keys)), self._note_velocity)
-            self._start(stack, ["velod.runtime.player", str(self._recording), *self._player_arguments()])
+            player = ["velod.runtime.player", str(self._recording), *self._player_arguments()]
+            self.driver_pid = self._start(stack, player)
             self.wait_until(lambda: len(self._heard_s) > 10, START_S, "no velocity came")
             self._stack = stack.pop_all()
         return self

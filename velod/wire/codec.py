@@ -6,6 +6,7 @@ given, it returns a message that keeps its schema's promises or raises WireError
 
 from __future__ import annotations
 
+import math
 import operator
 from collections.abc import Callable
 from copy import copy
@@ -222,7 +223,7 @@ def _read_column(s: Schema, f: Field, tree: dict[str, Any], sizes: dict[str, int
     assert f.dtype is not None
     data = _bin(s, f, tree)
     shape = tuple(part if isinstance(part, int) else sizes[part] for part in f.shape)
-    _check_length(s, f, len(data), int(np.prod(shape, dtype=np.int64)) * f.dtype.itemsize)
+    _check_length(s, f, len(data), math.prod(shape) * f.dtype.itemsize)
     # A copy, because a view of the received bytes is read-only, which numba takes for another type of array.
     return np.frombuffer(data, f.dtype).reshape(shape).astype(f.dtype.newbyteorder("="), copy=True)
 

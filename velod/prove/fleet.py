@@ -1,0 +1,134 @@
+"""``velod prove fleet``: many rigs publish velocity through one router to one consumer; rate, latency and CPU."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import ExitStack
+from dataclasses import dataclass
+
+import numpy as np
+
+from velod.client import Listener
+from velod.config import ZenohSettings
+from velod.prove.besieged import free_port
+from velod.prove.processes import cpu_s, resident_mib
+from velod.wire.topics import ANY_RIG, VELOCITY
+
+RIGS_PER_PROCESS = 100
+START_S = 60.0
+_WARM_UP_S = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Fleet:
+    """What came of a fleet."""
+
+    rigs: int
+    hz: float  # of each
+    seconds: float
+    rate_hz: float  # of velocities at the consumer
+    silent: int  # rigs that it never heard
+    lost: int  # by holes in seq
+    latency_p50_ms: float  # published to received
+    latency_p99_ms: float
+    router_cores: float  # CPU seconds per second
+    rigs_cores: float
+    consumer_cores: float
+    router_mib: float
+
+    @property
+    def share(self) -> float:
+        """Of what should have come."""
+        return self.rate_hz / (self.rigs * self.hz)
+
+
+class FleetError(RuntimeError):
+    """The processes did not come up; one line."""
+
+
+def run_fleet(rigs: int, hz: float, seconds: float) -> Fleet:
+    """A router, processes of simulated rigs with a session each, and a consumer of ``velod/*/velocity`` here.
+
+    Raises FleetError.
+    """
+    port = free_port()
+    endpoint = f"tcp/127.0.0.1:{port}"
+    with ExitStack() as stack:
+        router = _start(stack, ["velod.cli", "router", "--port", str(port)])
+        assert router.stderr is not None
+        if "up" not in (said := router.stderr.readline()):
+            raise FleetError(f"the router is not up: {said.strip()}")
+        listener = stack.enter_context(Listener(ANY_RIG, (VELOCITY,), ZenohSettings(connect=endpoint)))
+        groups = []
+        for first in range(0, rigs, RIGS_PER_PROCESS):
+            count = min(RIGS_PER_PROCESS, rigs - first)
+            groups.append(_start(stack, ["velod.prove.fleet_rigs", endpoint, str(first), str(count), f"{hz:g}"]))
+        for group in groups:
+            assert group.stdout is not None and group.stdin is not None
+            if group.stdout.readline() != "connected\n":
+                raise FleetError(f"{RIGS_PER_PROCESS} rigs did not connect: {group.poll()}")
+        for group in groups:
+            assert group.stdin is not None
+            group.stdin.write("go\n")
+            group.stdin.flush()
+        return _measure(listener, rigs, hz, seconds, router.pid, [group.pid for group in groups])
+
+
+def _measure(listener: Listener, rigs: int, hz: float, seconds: float, router: int, groups: list[int]) -> Fleet:
+    _receive(listener, _WARM_UP_S)
+    lost = listener.counters.get("gap.velocity", 0)
+    before = [sum(map(cpu_s, pids)) for pids in ([router], groups, [os.getpid()])]
+    start_s = time.monotonic()
+    latency_ms, heard = _receive(listener, seconds)
+    elapsed_s = time.monotonic() - start_s
+    after = [sum(map(cpu_s, pids)) for pids in ([router], groups, [os.getpid()])]
+    of_router, of_rigs, of_consumer = ((b - a) / elapsed_s for a, b in zip(before, after, strict=True))
+    p50, p99 = np.percentile(latency_ms, (50, 99)) if latency_ms else (np.nan, np.nan)
+    return Fleet(
+        rigs=rigs,
+        hz=hz,
+        seconds=elapsed_s,
+        rate_hz=len(latency_ms) / elapsed_s,
+        silent=rigs - len(heard),
+        lost=listener.counters.get("gap.velocity", 0) - lost,
+        latency_p50_ms=float(p50),
+        latency_p99_ms=float(p99),
+        router_cores=of_router,
+        rigs_cores=of_rigs,
+        consumer_cores=of_consumer,
+        router_mib=resident_mib(router),
+    )
+
+
+def _receive(listener: Listener, seconds: float) -> tuple[list[float], set[str]]:
+    """Latency of each velocity, ms, and the keys on which they came."""
+    latency_ms: list[float] = []
+    heard: set[str] = set()
+    end_s = time.monotonic() + seconds
+    while (left_s := end_s - time.monotonic()) > 0.0:
+        if (received := listener.receive(left_s)) is not None:
+            latency_ms.append((received.t_received_ns - received.envelope.t_pub_ns) * 1e-6)
+            heard.add(received.key)
+    return latency_ms, heard
+
+
+def _start(stack: ExitStack, module: list[str]) -> subprocess.Popen[str]:
+    """A process that ends when its stdin does, or on SIGTERM."""
+    pipe = subprocess.PIPE
+    command = [sys.executable, "-P", "-m", *module]
+    process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True)
+
+    def end() -> None:
+        process.send_signal(signal.SIGTERM)
+        try:
+            process.communicate(timeout=START_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.communicate()
+
+    stack.callback(end)
+    return process
