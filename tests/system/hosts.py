@@ -6,6 +6,7 @@ through the switch. Everything is made under names of this run and is gone after
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import signal
@@ -99,6 +100,7 @@ class Network:
             _ip("-n", self.switch, "link", "set", "br0", "up")
             for host in self.hosts.values():
                 self._add_host(stack, host)
+            self._introduce()
             self._stack = stack.pop_all()
         return self
 
@@ -122,6 +124,21 @@ class Network:
         _ip("-n", self.switch, "link", "set", host.port, "master", "br0", "up")
         _ip("-n", host.namespace, "addr", "add", f"{host.address}/24", "dev", "eth0")
         _ip("-n", host.namespace, "link", "set", "eth0", "up")
+
+    def _introduce(self) -> None:
+        """Every host knows the others' hardware addresses, as if they were behind routers.
+
+        A black hole is then one for IP alone; otherwise hosts would look for each other by ARP, once a second.
+        """
+        for host in self.hosts.values():
+            shown = subprocess.run(
+                ["ip", "-n", host.namespace, "-json", "link", "show", "eth0"], check=True, capture_output=True
+            )
+            hardware = json.loads(shown.stdout)[0]["address"]
+            for other in self.hosts.values():
+                if other is not host:
+                    at = ("neigh", "replace", host.address, "lladdr", hardware, "dev", "eth0", "nud", "permanent")
+                    _ip("-n", other.namespace, *at)
 
     def insert_shaper(self, host: Host, delay_ms: float, loss: float, mbit: float) -> None:
         """A bridge of the host's own, and a process that carries frames from there to the switch and back."""

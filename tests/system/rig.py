@@ -62,10 +62,19 @@ class Seen:
         steps = np.diff([row["sensor_t_ns"] for row in self.used]) * 1e-9
         return float(steps.min() if steps.min() <= 0.0 else steps.max())
 
+    def oldest_ms(self) -> float:
+        """The largest true age of a valid velocity when it was handed out, less the least latency of all."""
+        offset_ns = min(row["t_pub_ns"] - row["sensor_t_ns"] for row in self.raw)
+        return max(row["t_ns"] - row["sensor_t_ns"] - offset_ns for row in self.valid()) * 1e-6
+
     def lost(self) -> int:
         """Ticks of the output rate that were never handed out, between the first and the last."""
         t_ns = {row["sensor_t_ns"] for row in self.used}
         return round((max(t_ns) - min(t_ns)) * 75e-9) + 1 - len(t_ns)
+
+    def lost_on_the_way(self) -> int:
+        """Velocities that never arrived; those that came in one burst, of which a client keeps the newest, did."""
+        return self.counters.get("gap.velocity", 0) - self.counters.get("inbox.overflow.velocity", 0)
 
     def latency_ms(self) -> np.ndarray:
         """Batch closed -> velocity at the consumer, for the first velocity that uses each batch, ms."""
@@ -113,7 +122,9 @@ class Rig:
     recording: Path
     directory: Path
     settings: Settings = field(default_factory=Settings)
+    entrance: str = ""  # of a router that all processes meet at, instead of the introducer
     service: subprocess.Popen[str] | None = None
+    router: subprocess.Popen[str] | None = None
 
     @property
     def compute(self) -> Host:
@@ -122,8 +133,8 @@ class Rig:
 
     @property
     def endpoint(self) -> str:
-        """Of the service's introducer, from any host."""
-        return f"tcp/{self.compute.address}:{PORT}"
+        """Where the service is reached, from any host."""
+        return self.entrance or f"tcp/{self.compute.address}:{PORT}"
 
     def recorded(self) -> Recording:
         """The recording that is played."""
@@ -145,6 +156,18 @@ class Rig:
         self.wait_for("service", "INFO up", expected)
         if spare and not only:
             self.wait_for("service", "spare is ready", 1)
+
+    def start_router(self, endpoint: str) -> None:
+        """A router on the compute host, until it listens."""
+        arguments = ["router", "--port", str(PORT + 1), "--listen", endpoint, "--insecure"]
+        self.router = self._velod(self.compute, "router", *arguments)
+        self.wait_for("router", "INFO up", 1)
+
+    def kill_router(self) -> None:
+        """kill -9."""
+        assert self.router is not None
+        self.router.kill()
+        self.router.wait()
 
     def start_worker(self, host: str, worker: str) -> subprocess.Popen[str]:
         """One more worker, on any host, until it is up."""
