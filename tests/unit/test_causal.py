@@ -19,7 +19,7 @@ from velod.events.selection import GOOD, MAX_ASYMMETRY
 
 MS = 1_000_000
 MEMORY, REFRACTORY, CELL_PX, BORDER = 100 * MS, 10 * MS, 7, 5
-RING = [(dy, dx) for dy in (-2, 0, 2) for dx in (-2, 0, 2) if (dy, dx) != (0, 0)]
+RING = [(dy, dx) for dy in (-3, 0, 3) for dx in (-3, 0, 3) if (dy, dx) != (0, 0)]
 
 
 @dataclass
@@ -37,7 +37,7 @@ class Selected:
 def selected(events: Events, rest_ns: int = 0, capacity: int = 20_000) -> Selected:
     first, last, taken = (new_surface(HEIGHT, WIDTH) for _ in range(3))
     rows, columns = np.arange(HEIGHT) // CELL_PX, np.arange(WIDTH) // CELL_PX
-    at, stamps = np.empty((capacity, 3), np.int32), np.empty((capacity, 25), np.int64)
+    at, stamps = np.empty((capacity, 3), np.int32), np.empty((capacity, 49), np.int64)
     n = enter_and_select(
         events.x, events.y, events.t_ns, events.p, first, last, REFRACTORY,
         taken, all_open(rows[-1] + 1, columns[-1] + 1), rows, columns, rest_ns, BORDER,
@@ -81,9 +81,9 @@ def twin(events: Events, rest_ns: int) -> Selected:
             gate = 0.35 if t >= opens.get(cell, NEVER) + rest_ns else GOOD * 0.35
             if n and rms < gate * math.hypot(gx, gy):
                 at.append((p, r, c))
-                stamps.append(patch)
+                stamps.append([first.get((p, r + i, c + j), NEVER) for i in range(-3, 4) for j in range(-3, 4)])
                 taken[p, r, c], opens[cell] = middle, t + rest_ns
-    return Selected(np.array(at).reshape(-1, 3), np.array(stamps, np.int64).reshape(-1, 25))
+    return Selected(np.array(at).reshape(-1, 3), np.array(stamps, np.int64).reshape(-1, 49))
 
 
 def noisy(jitter_ns: int, seed: int = 1, **how: Any) -> Events:
@@ -105,12 +105,12 @@ def test_the_kernel_selects_what_its_plain_twin_does() -> None:
 
 
 def test_an_event_is_selected_by_the_one_that_completes_its_neighbourhood() -> None:
-    # A vertical edge, one column every 2 ms: column x is complete when column x + 2 has fired.
+    # A vertical edge, one column every 2 ms: column x is complete when column x + 3 has fired.
     events = edges(speed=500.0, spacing_px=1000.0, seconds=0.1)
     s = selected(events)
-    assert np.array_equal(s.completed_ns - s.stamps[:, 12], np.full(len(s.at), 4 * MS))
+    assert np.array_equal(s.completed_ns - s.stamps[:, 24], np.full(len(s.at), 6 * MS))
     assert set(map(tuple, s.at[:, 1:].tolist())) == {
-        (y, x) for y in range(BORDER, HEIGHT - BORDER) for x in range(BORDER, 48)
+        (y, x) for y in range(BORDER, HEIGHT - BORDER) for x in range(BORDER, 47)
     }
 
 

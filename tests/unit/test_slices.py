@@ -51,7 +51,7 @@ def test_slices_end_on_their_grid_or_with_the_batch_and_are_numbered_one_by_one(
     assert [p.seq for p in parts] == list(range(len(parts)))
     for p in parts:
         # what completes a neighbourhood lies in the slice
-        newest_age = np.where(p.patch > 0, p.patch, 2**31).min(axis=1)
+        newest_age = np.where(p.ring > 0, p.ring, 2**31).min(axis=1)
         assert ((newest_age >= 1) & (newest_age <= 2 * MS)).all()
 
 

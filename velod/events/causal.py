@@ -1,7 +1,7 @@
 """Selection event by event: an event is selected the moment the last of its neighbourhood has fired.
 
-The same rule as ``select_burst``, without a batch: each first event of a burst completes the neighbourhoods of those
-of the eight pixels two away behind which the edge has just passed. What is selected depends on the stream up to that
+The same rule as ``select_burst``, without a batch: each first event of a burst completes the 7x7 of those of the
+eight pixels three away whose neighbourhood the edge has now passed. What is selected depends on the stream up to that
 event alone. Every cell of a coarse grid rests for a while after a selection, which keeps the image evenly covered and
 bounds the rate.
 """
@@ -14,10 +14,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from velod.events.plane_fit import HALF, SIZE, fit_plane
+from velod.events.plane_fit import HALF, REACH, SIZE, WIDE_SIZE, fit_plane
 from velod.events.sae import NEVER
 from velod.events.selection import GOOD, MAX_ASYMMETRY
-from velod.types import I64, PATCH, U8, U16, U32
+from velod.types import I64, PATCH, U8, U16, U32, WIDE
 
 I32 = NDArray[np.int32]
 
@@ -54,11 +54,11 @@ def enter_and_select(
     ``rest_ns`` after the last.
 
     Writes (p, y, x) of the selected to ``at`` (capacity, 3) and the stamps of their neighbourhoods to ``stamps``
-    (capacity, 25), row-major, NEVER where none, from row ``n`` on; returns the number of rows then filled. What does
-    not fit is not selected.
+    (capacity, 49), 7x7 row-major, NEVER where none, from row ``n`` on; returns the number of rows then filled. What
+    does not fit is not selected.
     """
     _, h, w = first.shape
-    low = max(border_px, HALF)
+    low = max(border_px, REACH)
     age = np.empty(SIZE, np.float64)
     for i in range(t_ns.size):
         k, r, c, t = int(p[i]), int(y[i]), int(x[i]), int(t_ns[i])
@@ -67,12 +67,12 @@ def enter_and_select(
         if in_burst:
             continue
         first[k, r, c] = t
-        for dr in range(-HALF, HALF + 1, HALF):
+        for dr in range(-REACH, REACH + 1, REACH):
             rm = r - dr
             if rm < low or rm >= h - low:
                 continue
             opens = open_ns[row_cell[rm]]
-            for dc in range(-HALF, HALF + 1, HALF):
+            for dc in range(-REACH, REACH + 1, REACH):
                 cm = c - dc
                 if cm < low or cm >= w - low or t < opens[column_cell[cm]] or n == len(at) or (dr == 0 and dc == 0):
                     continue
@@ -92,8 +92,8 @@ def enter_and_select(
                 if left == 0 or not rms < (1.0 if waited else GOOD) * max_rms_px * math.hypot(gx, gy):
                     continue
                 at[n, 0], at[n, 1], at[n, 2] = k, rm, cm
-                for q in range(SIZE):
-                    stamps[n, q] = first[k, rm - HALF + q // PATCH, cm - HALF + q % PATCH]
+                for q in range(WIDE_SIZE):
+                    stamps[n, q] = first[k, rm - REACH + q // WIDE, cm - REACH + q % WIDE]
                 n += 1
                 taken[k, rm, cm] = middle
                 opens[column_cell[cm]] = t + rest_ns
@@ -106,7 +106,7 @@ def _symmetric(surface: I64, r: int, c: int, t: int, memory_ns: int) -> bool:
     middle = min(t - surface[r, c], memory_ns)
     symmetric = antisymmetric = 0
     for j in range(4):
-        dr, dc = HALF * (j // 3 - 1), HALF * (j % 3 - 1)
+        dr, dc = REACH * (j // 3 - 1), REACH * (j % 3 - 1)
         a = min(t - surface[r + dr, c + dc], memory_ns) - middle
         b = min(t - surface[r - dr, c - dc], memory_ns) - middle
         symmetric += abs(a + b)

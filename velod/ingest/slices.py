@@ -10,16 +10,20 @@ import numpy as np
 
 from velod.config import Settings
 from velod.events.causal import ages_of, all_open, enter_and_select
-from velod.events.plane_fit import SIZE
+from velod.events.plane_fit import RING_COLUMN, RING_ROW, WIDE_SIZE
 from velod.events.sae import new_surface
 from velod.events.selection import cell_side_px
 from velod.ingest.batch import OpenBatch
 from velod.ingest.stream import CameraStream
-from velod.types import U8, U16, U32, EventBatch
+from velod.types import U8, U16, U32, WIDE, EventBatch
 
 MAX_SELECTED = 65_535
 """Events that one batch can carry (uint16 positions); a batch that is full selects no more."""
 MAX_AGE_NS = 2**32 - 1
+MIDDLE = WIDE_SIZE // 2
+RING = RING_ROW * WIDE + RING_COLUMN
+INNER = np.setdiff1d(np.arange(WIDE_SIZE), RING)
+"""Where in a 7x7 the event, the neighbours around the 5x5 and the 5x5 are."""
 
 
 class Slices:
@@ -34,7 +38,7 @@ class Slices:
         self._row_cell, self._column_cell = np.arange(height) // cell_px, np.arange(width) // cell_px
         # Pages that are never written to cost nothing.
         self._at = np.empty((MAX_SELECTED, 3), np.int32)
-        self._stamps = np.empty((MAX_SELECTED, SIZE), np.int64)
+        self._stamps = np.empty((MAX_SELECTED, WIDE_SIZE), np.int64)
         self._shape = (height, width)
         self._seq = -1
         self.forget()
@@ -91,7 +95,7 @@ class Slices:
     def selected(self, t_end_ns: int) -> tuple[U16, U16, U32, U8]:
         """x, y, age (ns before ``t_end_ns``) and p of all events that were selected since ``begin_batch``."""
         p, y, x = self._at[: self._n].T
-        age = np.minimum(t_end_ns - self._stamps[: self._n, SIZE // 2], MAX_AGE_NS)
+        age = np.minimum(t_end_ns - self._stamps[: self._n, MIDDLE], MAX_AGE_NS)
         return x.astype(np.uint16), y.astype(np.uint16), age.astype(np.uint32), p.astype(np.uint8)
 
     def _enter(self, left: CameraStream, batch: OpenBatch, t_ns: int, rest_ns: int) -> None:
@@ -115,13 +119,13 @@ class Slices:
         first, new = self._sent, slice(self._sent, self._n)
         n_events, self._n_events = self._n_events, 0
         p, y, x = self._at[new].T
-        patch = ages_of(self._stamps[new], t_end_ns, self._memory_ns)
+        wide = ages_of(self._stamps[new], t_end_ns, self._memory_ns)
         self._sent = self._n
         if self._t_start_ns < 0:
             assert batch.t_start_ns is not None
             self._t_start_ns = batch.t_start_ns
         return EventBatch(
             self._seq, t_end_ns, self._t_start_ns, n_events,
-            x.astype(np.uint16), y.astype(np.uint16), patch[:, SIZE // 2].copy(), p.astype(np.uint8), patch,
-            batch_seq, first,
+            x.astype(np.uint16), y.astype(np.uint16), wide[:, MIDDLE].copy(), p.astype(np.uint8), wide[:, INNER],
+            batch_seq, first, wide[:, RING],
         )  # fmt: skip
