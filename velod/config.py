@@ -199,13 +199,13 @@ class OptimizerSettings:
     )
     fixed_sigma_px_s: float = _f(20.0, "sigma of a flow residual with weights = 'fixed', px/s", above=0.0, hi=1e4)
     shared_error: float = _f(
-        10.0, "information of a batch is divided by this for errors its flows share", lo=1.0, hi=100.0
+        7.0, "information of a batch is divided by this for errors its flows share", lo=1.0, hi=100.0
     )
     flow_scale_sigma: float = _f(
-        0.004, "1 sigma of an error of all flows' speeds, as a share, which lasts a second", above=0.0, hi=0.1
+        0.004, "1 sigma of an error of all flows' speeds, as a share, which lasts seconds", above=0.0, hi=0.1
     )
     depth_scale_sigma: float = _f(
-        0.003, "1 sigma of an error of all inverse depths, as a share, which lasts a second", above=0.0, hi=0.1
+        0.003, "1 sigma of an error of all inverse depths, as a share, which lasts seconds", above=0.0, hi=0.1
     )
     delay_sigma_ms: float = _f(
         1.0, "1 sigma of how much later than the IMU's the events' stamps are, ms", above=0.0, hi=100.0

@@ -10,7 +10,7 @@ import numpy as np
 from velod.config import Settings
 from velod.geometry.calibration import Calibration
 from velod.geometry.rectify import rectify
-from velod.geometry.so3 import hat, log
+from velod.geometry.so3 import hat
 from velod.optimizer import attitude, degeneracy, flow_equation, inertial_residual
 from velod.optimizer.attitude import Attitude
 from velod.optimizer.consistency import Consistency
@@ -59,6 +59,7 @@ class Head:
     R_LB: F64
     cov: F64
     common: F64  # (3,) common errors of the flows, flow_equation.COMMON
+    e_L: F64  # (3,) e of v_B = R_BL (s_L + e), m/s
 
     @property
     def gravity_direction_sigma(self) -> float:
@@ -108,6 +109,7 @@ class Estimator:
         )
         self.head: Head | None = None
         self.batches = 0  # that gave a velocity
+        self.first_usable_t_ns = -1
         self.last_usable_t_ns = 0
         self.own_solution: tuple[int, F64, F64] | None = None  # end of the newest batch with one, s_L there, its e
         self._open: list[Interval] = []  # that may get flows yet; the last one is incomplete
@@ -140,7 +142,7 @@ class Estimator:
         if self.window.empty:
             if equations is None and not still:
                 return
-            self._start(flow.t_ns - QUIET_NS if equations is None else int(equations.on_error.t_ns.min()))
+            self._start(flow.t_ns - QUIET_NS if equations is None else int(equations.on_error.t_ns.min()), flow.t_ns)
         if not late:
             self._extend_to(flow.t_ns)
         if equations is not None:
@@ -251,7 +253,7 @@ class Estimator:
         )
         R, s_L, _ = self.memory.at(before)
         dt = ACCELERATION_NS * 1e-9
-        turned = log(R[0].T @ R[1]), log(R[1].T @ R[2])
+        turned = _small_turn(R[0].T @ R[1]), _small_turn(R[1].T @ R[2])
         e = self._e(before, head)
         v_dot_B = (R[2].T @ (s_L[2] + e[2]) - R[0].T @ (s_L[0] + e[0])) / (2.0 * dt)
         w_B, w_dot_B = (turned[0] + turned[1]) / (2.0 * dt), (turned[1] - turned[0]) / dt**2
@@ -294,11 +296,10 @@ class Estimator:
         across = flow_equation.on_error(replace(on_velocity, a=across_B), R_LB, s_L).a
         return Equations(on_error if self._o.spline == "error" else on_velocity, on_error, measured, common, across)
 
-    def _e(self, t_ns: I64, head: Head) -> F64:
+    @staticmethod
+    def _e(t_ns: I64, head: Head) -> F64:
         """e (m, 3) at ``t_ns`` (m,), from the head on along the slope of gravity."""
-        _, s_L, _ = self.memory.at(np.array([head.t_ns]))
-        e: F64 = head.R_LB @ head.v_B - s_L[0] - head.g_L * ((t_ns - head.t_ns) * 1e-9)[:, None]
-        return e
+        return head.e_L - np.outer((t_ns - head.t_ns) * 1e-9, head.g_L)
 
     def _fit(self, t_ns: int, equations: Equations) -> Fit | None:
         """The batch's own solution for e at ``t_ns``: gravity, which e holds, is taken from what is known of it.
@@ -321,8 +322,10 @@ class Estimator:
             fit = flow_equation.solve_weighted(still, measured, iterations, seed, RIDGE)
         return None if fit is None else replace(fit, e=fit.e + predicted_e)
 
-    def _start(self, t_ns: int) -> None:
-        self.window.start(t_ns)
+    def _start(self, t_ns: int, until_ns: int) -> None:
+        """Open the window at ``t_ns``, with the mean specific force up to ``until_ns``."""
+        _, s_L, _ = self.memory.at(np.array([t_ns, until_ns]))
+        self.window.start(t_ns, (s_L[1] - s_L[0]) / max((until_ns - t_ns) * 1e-9, 1e-3))
         self._open = [self._interval_from(t_ns)]
         self._started_ns = t_ns
 
@@ -396,7 +399,11 @@ class Estimator:
             R_LB, _, _ = self._frame(t_ns)
             degeneracy.without(bins.L, bins.eta, weak_L if self._o.spline == "error" else weak_L @ R_LB)
         self._share_out(bins)
+        self._note_usable(t_ns)
+
+    def _note_usable(self, t_ns: int) -> None:
         self.batches += 1
+        self.first_usable_t_ns = t_ns if self.first_usable_t_ns < 0 else self.first_usable_t_ns
         self.last_usable_t_ns = max(self.last_usable_t_ns, t_ns)
 
     def _share_out(self, bins: Bins) -> None:
@@ -423,8 +430,7 @@ class Estimator:
         self._still_to = t_ns
         self._weak_L = np.empty((0, 3))
         self._count("standstill")
-        self.batches += 1
-        self.last_usable_t_ns = t_ns
+        self._note_usable(t_ns)
 
     def _still_sigma(self) -> float:
         return self._standstill.sigma(self._depth_m / self._camera[0])
@@ -449,6 +455,7 @@ class Estimator:
             if np.linalg.norm(s_L[0]) > MAX_INTEGRATED:
                 self.memory.shift(-s_L[0])
                 self.window.shift(s_L[0])
+                self.head = replace(self.head, e_L=self.head.e_L + s_L[0])
                 for interval in self._open:
                     interval.shift(s_L[0])
 
@@ -467,7 +474,14 @@ class Estimator:
         T[:3, :3] = M
         cov = T @ solution.cov(F) @ T.T
         common = solution.x[self.window.common_columns(locate(t_ns, self._knot_ns)[0])]
-        self.head = Head(t_ns, N + M @ x[:3], x[3:6], x[6:9], x[9:12], R_LB, cov, common)
+        v_B = N + M @ x[:3]
+        e_L = x[:3] if self._o.spline == "error" else R_LB @ v_B - self.memory.at(np.array([t_ns]))[1][0]
+        self.head = Head(t_ns, v_B, x[3:6], x[6:9], x[9:12], R_LB, cov, common, e_L)
+
+
+def _small_turn(R: F64) -> F64:
+    """Rotation vector (3,) of a small rotation (3, 3), to the third order."""
+    return np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / 2.0
 
 
 def _lack(flow: FlowBatch, depth: DepthBatch) -> str:

@@ -159,9 +159,16 @@ def solve(rows: Rows, iterations: int, seed: int, ridge: float = 0.0) -> Fit | N
 
     Returns None where the rows do not determine a velocity; with a ``ridge`` (RIDGE), e is 0 where they do not.
     """
-    m = len(rows.z)
-    weight, e, cov, stats = np.zeros(m), np.zeros(3), np.zeros((3, 3)), np.zeros(2)
-    if m < 3 or not _solve(rows.a, rows.z, rows.sigma, iterations, seed & 0x7FFFFFFF, ridge, weight, e, cov, stats):
+    e, H, g = np.zeros(3), np.empty((3, 3)), np.empty(3)
+    if len(rows.z) < 3 or not _ransac(rows.a, rows.z, rows.sigma, iterations, seed & 0x7FFFFFFF, ridge, e, H, g):
+        return None
+    return _reweighted(rows, e, ridge)
+
+
+def _reweighted(rows: Rows, start: F64, ridge: float) -> Fit | None:
+    """Redescending least squares from ``start`` (3,)."""
+    weight, e, cov, stats = np.zeros(len(rows.z)), start.copy(), np.zeros((3, 3)), np.zeros(2)
+    if not _reweight(rows.a, rows.z, rows.sigma, ridge, weight, e, cov, stats):
         return None
     return Fit(e, cov, weight, float(stats[0]), float(stats[1]))
 
@@ -176,7 +183,7 @@ def solve_weighted(rows: Rows, measured: Measured, iterations: int, seed: int, r
     if first is None:
         return None
     rows.sigma[:] = sigmas(measured, rows.z - rows.a @ first.e)
-    return solve(rows, iterations, seed, ridge)
+    return _reweighted(rows, first.e, ridge)
 
 
 def compress(rows: Rows, c: F64, fit: Fit, shared_error: float) -> Bins:
@@ -340,11 +347,10 @@ def _ransac(a, z, sigma, iterations, seed, ridge, best, H, g):  # type: ignore[n
 
 
 @njit(cache=True, nogil=True)
-def _solve(a, z, sigma, iterations, seed, ridge, weight, e, cov, stats):  # type: ignore[no-untyped-def]
+def _reweight(a, z, sigma, ridge, weight, e, cov, stats):  # type: ignore[no-untyped-def]
+    """Five rounds of Tukey's weights from ``e`` (3,) on, in place; False where the rows do not determine it."""
     m = len(z)
     H, g, r = np.empty((3, 3)), np.empty(3), np.empty(m)
-    if not _ransac(a, z, sigma, iterations, seed, ridge, e, H, g):
-        return False
     scale = 1.0
     for _ in range(5):
         for k in range(m):

@@ -24,13 +24,15 @@ from velod.types import F64, I64
 
 UNKNOWN_VELOCITY = 100.0
 """Prior sigma of the first control points, m/s: no knowledge."""
+ACCELERATION = 3.0
+"""Sigma of the acceleration at the start, m/s^2, where the specific force's norm does not speak of more."""
 NORM_SIGMA = 0.02
 """Of |g| = gravity, m/s^2: local gravity differs from the setting."""
 
 _GONE = np.concatenate([np.arange(3), HEAD + np.arange(3, BLOCK)])
 """Columns of what leaves with the oldest segment: its first control point, its biases and its gravity."""
 _SELECTED = np.arange(3, 12)
-COMMON_S = np.array([1.0, 1.0, 100.0])
+COMMON_S = np.array([3.0, 3.0, 100.0])
 """How long common errors last, s: flow and depth scale change with the scene, the delay hardly does."""
 
 
@@ -94,8 +96,12 @@ class Window:
         """Whether ``t_ns`` lies in a segment of the window."""
         return not self.empty and self.first <= locate(t_ns, self._knot_ns)[0] <= self.last
 
-    def start(self, t_ns: int) -> None:
-        """Open the first segment, that of ``t_ns``, knowing nothing but the priors of the biases."""
+    def start(self, t_ns: int, force_L: F64) -> None:
+        """Open the first segment, that of ``t_ns``, knowing nothing but priors.
+
+        ``force_L`` (3,): the specific force of the moment, of which gravity is what acceleration leaves. The closer
+        its norm is to gravity's, the less acceleration there will be in it.
+        """
         self.first = self.last = locate(t_ns, self._knot_ns)[0]
         self._H[:] = 0.0
         self._h[:] = 0.0
@@ -106,7 +112,11 @@ class Window:
         sigma = self._bias_margin * np.repeat([self._imu.accel_bias_sigma, self._imu.gyro_bias_sigma], 3)
         self._H[b, b] = 1.0 / sigma**2
         g = self.gravity_columns(self.last)
-        self._H[g, g] = 1.0 / self._imu.gravity**2
+        gravity = self._imu.gravity
+        acceleration = math.hypot(ACCELERATION, 2.0 * (float(np.linalg.norm(force_L)) - gravity))
+        self._H[g, g] = 1.0 / min(acceleration, gravity) ** 2
+        if acceleration < gravity:
+            self._h[g] = force_L / acceleration**2
         c = self.common_columns(self.last)
         self._H[c, c] = 1.0 / self._common_sigma**2
         self._smooth_newest()
