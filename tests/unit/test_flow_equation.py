@@ -18,6 +18,7 @@ from velod.optimizer.flow_equation import (
     sigmas,
     solve,
     solve_weighted,
+    turn_sensitivity,
 )
 
 
@@ -199,3 +200,19 @@ def test_the_rows_of_common_errors_are_central_differences():
     for k in range(len(COMMON)):
         d = np.eye(3)[k] * h
         assert np.allclose(rows[:, k], (flow(*d) - flow(*-d)) / (2 * h), rtol=1e-6, atol=1e-4), COMMON[k]
+
+
+def test_what_an_error_of_the_angular_velocity_does_to_a_fit_is_a_central_difference():
+    rng = np.random.default_rng(4)
+    rows = rows_of(np.array([1.0, 2.0, -3.0]), np.zeros(3), rng)
+    fit = solve(rows, 64, 1)
+    w = fit.weight / rows.sigma**2
+
+    def fitted(n):
+        """Least squares with the weights of the fit."""
+        aw = rows.a.T * w
+        return np.linalg.solve(aw @ rows.a, aw @ (rows.z + rows.b @ n))
+
+    h = 1e-4
+    numeric = np.column_stack([(fitted(d) - fitted(-d)) / (2 * h) for d in np.eye(3) * h])
+    assert np.allclose(turn_sensitivity(rows, fit), numeric, rtol=1e-5, atol=1e-9)

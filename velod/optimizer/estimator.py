@@ -275,7 +275,8 @@ class Estimator:
         inside = (t >= self.memory.t_ns[0]) & (self.window.empty | (t >= self.window.first * self._knot_ns))
         at_flow, at_depth, t = at_flow[inside], at_depth[inside], t[inside]
         if len(t) < self._o.min_flows:
-            self._count("fit.few_flows")
+            if flow.n_selected > 0:
+                self._count("fit.few_flows")
             self.lacking = _lack(flow, depth)
             return None
         inv_depth = depth.inv_depth[at_depth]
@@ -388,7 +389,7 @@ class Estimator:
         self.own_solution = None if len(weak_L) else (t_ns, self.memory.at(np.array([t_ns]))[1][0], fit.e)
         shared = self._o.shared_error
         if predicted is not None:
-            innovation = self._innovation(t_ns, fit, predicted, weak_L)
+            innovation = self._innovation(t_ns, equations.on_error, fit, predicted, weak_L)
             self.consistency.note(innovation)
             shared *= max(1.0, innovation / INNOVATION_GATE)
         if shared > self._o.shared_error:
@@ -435,7 +436,7 @@ class Estimator:
     def _still_sigma(self) -> float:
         return self._standstill.sigma(self._depth_m / self._camera[0])
 
-    def _innovation(self, t_ns: int, fit: Fit, predicted: tuple[F64, F64], weak_L: F64) -> float:
+    def _innovation(self, t_ns: int, rows: Rows, fit: Fit, predicted: tuple[F64, F64], weak_L: F64) -> float:
         """Squared Mahalanobis distance of the batch's own velocity from the predicted one, as of three dimensions.
 
         The directions ``weak_L`` (k, 3), which the batch does not determine, do not count.
@@ -445,7 +446,10 @@ class Estimator:
             return 3.0
         R, s_L, _ = self.memory.at(np.array([t_ns]))
         d = seen @ (s_L[0] + fit.e - R[0] @ predicted[0])
-        S = seen @ (fit.cov * self._o.shared_error + R[0] @ predicted[1] @ R[0].T) @ seen.T
+        seen_s = max(int(rows.t_ns.max() - rows.t_ns.min()), BIN_NS) * 1e-9
+        turned = flow_equation.turn_sensitivity(rows, fit) * self._imu.gyro_noise
+        own = fit.cov * self._o.shared_error + turned @ turned.T / seen_s
+        S = seen @ (own + R[0] @ predicted[1] @ R[0].T) @ seen.T
         return float(d @ np.linalg.solve(S, d)) * 3.0 / len(seen)
 
     def _keep_error_small(self) -> None:

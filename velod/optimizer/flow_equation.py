@@ -186,6 +186,13 @@ def solve_weighted(rows: Rows, measured: Measured, iterations: int, seed: int, r
     return _reweighted(rows, first.e, ridge)
 
 
+def turn_sensitivity(rows: Rows, fit: Fit) -> F64:
+    """d e / d n (3, 3) of a batch's own solution: what an error n of the angular velocity, rad/s, does to it."""
+    weighted = rows.a * (fit.weight / (rows.sigma * fit.scale) ** 2)[:, None]
+    d_e_d_n: F64 = fit.cov @ (weighted.T @ rows.b)
+    return d_e_d_n
+
+
 def compress(rows: Rows, c: F64, fit: Fit, shared_error: float) -> Bins:
     """The rows, with those of ``common`` ``c`` (m, 3), as information in bins.
 
