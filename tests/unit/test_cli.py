@@ -25,7 +25,8 @@ from velod.io import open_recording
 COMMANDS = ("demo", "run", "replay", "eval", "sim", "echo", "top", "config", "bench", "warmup")
 EVAL_KEYS = [
     *("ave_mps", "rve_percent", "p95_mps", "n", "first_valid_s", "valid_fraction", "ave_floor_mps", "nees_mean"),
-    *("drift_percent", "real_time_factor", "latency_p50_ms", "latency_p99_ms"),
+    *("drift_percent", "real_time_factor", "latency_p50_ms", "latency_p99_ms", "median_mps", "rve_median_percent"),
+    *("rve_p95_percent", "within_1_sigma", "within_2_sigma", "within_3_sigma"),
 ]
 CSV_HEADER = (
     "t_ns,vx,vy,vz,cov_xx,cov_xy,cov_xz,cov_yy,cov_yz,cov_zz,state,valid,age_ms,"

@@ -35,6 +35,9 @@ def test_ave_and_rve_are_means_over_what_was_published() -> None:
     assert got.n == 2
     assert got.ave_mps == pytest.approx(0.18)
     assert got.rve_percent == pytest.approx(50 * (0.28 / math.hypot(1.5, 2) + 0.08 / math.hypot(2.5, 2)))
+    assert got.rve_quartiles_percent[1] == pytest.approx(got.rve_percent)  # of two, the median is the mean
+    assert got.rve_quartiles_percent[0] < got.rve_quartiles_percent[1] < got.rve_quartiles_percent[2]
+    assert got.rve_quartiles_percent[2] < got.rve_p95_percent < 11.2
     assert got.nees_mean == pytest.approx((7.84 + 0.64) / 2)
     assert (got.within_1_sigma, got.within_2_sigma, got.within_3_sigma) == pytest.approx((0.5, 0.5, 1.0))
 

@@ -62,6 +62,12 @@ class Metrics:
             "real_time_factor": real_time_factor,
             "latency_p50_ms": latency_p50_ms,
             "latency_p99_ms": latency_p99_ms,
+            "median_mps": self.median_mps,
+            "rve_median_percent": self.rve_quartiles_percent[1],
+            "rve_p95_percent": self.rve_p95_percent,
+            "within_1_sigma": self.within_1_sigma,
+            "within_2_sigma": self.within_2_sigma,
+            "within_3_sigma": self.within_3_sigma,
         }
         return {key: v if v is not None and math.isfinite(v) else None for key, v in values.items()}
 
@@ -74,7 +80,8 @@ class Metrics:
             (
                 f"AVE            {self.ave_mps:8.4f} m/s   (median {self.median_mps:.4f}, 95 % {self.p95_mps:.4f}, "
                 f"largest {self.max_mps:.4f})",
-                f"RVE            {self.rve_percent:8.2f} %",
+                f"RVE            {self.rve_percent:8.2f} %     (median {self.rve_quartiles_percent[1]:.2f}, 95 % "
+                f"{self.rve_p95_percent:.2f})",
                 f"median speed   {self.median_speed_mps:8.4f} m/s   (truth {self.median_true_speed_mps:.4f})",
                 f"velocities     {self.n:8d}       ({100 * self.valid_fraction:.1f} % valid, the first after "
                 f"{self.first_valid_s:.3f} s)",
