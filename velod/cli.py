@@ -121,6 +121,12 @@ def _top(args: argparse.Namespace) -> int:
     return top(args.config, cli_network.way_of(args), once=args.once)
 
 
+def _view(args: argparse.Namespace) -> int:
+    from velod.cli_view import view
+
+    return view(args.config, cli_network.way_of(args), args.save, args.seconds, args.port)
+
+
 def _config_show(args: argparse.Namespace) -> int:
     from velod.cli_config import show
 
@@ -190,6 +196,7 @@ first steps:
         _add_sim,
         _add_echo,
         _add_top,
+        _add_view,
         _add_router,
         _add_config,
         _add_bench,
@@ -429,6 +436,24 @@ def _add_top(commands: _Commands[argparse.ArgumentParser]) -> None:
     )
     _add_watch_options(parser)
     parser.add_argument("--once", action="store_true", help="print one table and stop")
+
+
+def _add_view(commands: _Commands[argparse.ArgumentParser]) -> None:
+    parser = _command(
+        commands,
+        "view",
+        _view,
+        "Selected events, flow, depth and velocity in the Rerun viewer.",
+        "Needs the extra 'view' (rerun-sdk). The viewer listens on loopback only, its analytics are off. The\n"
+        "timeline is the sensor's time. What is faint is unsure; velocities have a band of three sigmas.",
+        "  velod view                            the velod on this host, live\n"
+        "  velod view --save run.rrd --seconds 10\n"
+        "                                        into a file, for rerun run.rrd",
+    )
+    _add_watch_options(parser)
+    parser.add_argument("--save", metavar="FILE", help="write a recording for the viewer instead of opening it")
+    parser.add_argument("--seconds", type=_seconds, metavar="S", help="stop after S seconds (default: never)")
+    parser.add_argument("--port", type=int, default=9876, help="of the viewer on loopback (default 9876)")
 
 
 def _add_router(commands: _Commands[argparse.ArgumentParser]) -> None:
