@@ -109,6 +109,12 @@ def _sim(args: argparse.Namespace) -> int:
     return simulate_to_file(recipe_of(args), args.output, args.seconds, args.seed)
 
 
+def _odometry(args: argparse.Namespace) -> int:
+    from velod.cli_watch import reset_odometry
+
+    return reset_odometry(args.config, cli_network.way_of(args))
+
+
 def _echo(args: argparse.Namespace) -> int:
     from velod.cli_watch import echo
 
@@ -195,6 +201,7 @@ first steps:
         _add_eval,
         _add_sim,
         _add_echo,
+        _add_odometry,
         _add_top,
         _add_view,
         _add_router,
@@ -421,6 +428,20 @@ def _add_echo(commands: _Commands[argparse.ArgumentParser]) -> None:
     parser.add_argument(
         "--timeout", type=_seconds, metavar="S", help="give up after S seconds without a message (default: never)"
     )
+
+
+def _add_odometry(commands: _Commands[argparse.ArgumentParser]) -> None:
+    parser = _command(
+        commands,
+        "odometry",
+        _odometry,
+        "Begin the dead reckoning anew: position zero, heading zero.",
+        "A query on velod/<rig>/odometry/reset does the same, in any language. What comes out: velod echo odometry.",
+        "  velod odometry reset\n"
+        "  velod odometry reset --connect tls/10.0.0.5:17448 --keys /etc/velod/keys --rig drone",
+    )
+    parser.add_argument("action", choices=("reset",), help="what to do")
+    _add_watch_options(parser)
 
 
 def _add_top(commands: _Commands[argparse.ArgumentParser]) -> None:

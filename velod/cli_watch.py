@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import sys
 import time
@@ -16,9 +17,9 @@ from velod.cli_report import describe_attitude, describe_velocity
 from velod.client import Listener, Received
 from velod.config import ZenohSettings
 from velod.runtime.dispatching import SENT
-from velod.runtime.session import introducer_endpoint
+from velod.runtime.session import introducer_endpoint, open_session
 from velod.types import Health, Velocity
-from velod.wire.topics import ANY_RIG, HEALTH, ODOMETRY, TOPICS, VELOCITY, parts
+from velod.wire.topics import ANY_RIG, HEALTH, ODOMETRY, ODOMETRY_RESET, TOPICS, VELOCITY, key, parts
 
 _CLEAR_SCREEN = "\x1b[H\x1b[2J"
 _REFRESH_S = 1.0
@@ -80,6 +81,19 @@ def echo(config: str | None, topic: str, way: Way, count: int | None, timeout_s:
             whose = f"{parts(TOPICS[topic], received.key)['rig']}: " if place.rig == ANY_RIG else ""
             print(f"{whose}{describe(received)}", flush=True)
             printed += 1
+    return 0
+
+
+def reset_odometry(config: str | None, way: Way) -> int:
+    """Ask the optimizers to begin their dead reckoning anew; 1 if none answers."""
+    place = place_of(config, way, "operator")
+    with open_session(place.zenoh) as session:
+        replies = session.get(key(ODOMETRY_RESET, place.rig), timeout=_DISCOVERY_S)
+        done = [json.loads(reply.ok.payload.to_string())["reset_by"] for reply in replies if reply.ok is not None]
+    if not done:
+        print(f"velod: no optimizer of rig {place.rig} answers ({place.connect})", file=sys.stderr)
+        return EXIT_FAILED
+    print(f"reset by {', '.join(sorted(done))}: the next odometry begins at zero")
     return 0
 
 

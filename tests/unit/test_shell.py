@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext
 from threading import Event, Thread
 from typing import Any
 
@@ -12,6 +13,9 @@ import numpy as np
 import pytest
 import zenoh
 
+from velod import cli_watch
+from velod.cli_exit import EXIT_FAILED
+from velod.cli_watch import Way
 from velod.config import Settings, ZenohSettings
 from velod.runtime.outlet import Outlet
 from velod.runtime.roles import SHELLS
@@ -186,3 +190,24 @@ def test_silence_of_one_publisher_is_an_alarm(session: zenoh.Session) -> None:
         bench.outlet.publish(DEPTH, depth_batch(1, 2))
         time.sleep(0.1)
         assert [name for name in bench.shell.alarms() if name.startswith("stale")] == ["stale.velod/rig0/flow"]
+
+
+def test_a_query_resets_the_odometry_of_every_optimizer_that_hears_it(
+    session: zenoh.Session, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Reckoner(FakeStage):
+        resets = 0
+
+        def reset_odometry(self) -> None:
+            self.resets += 1
+
+    stage = Reckoner(lambda message: [])
+    monkeypatch.setattr(cli_watch, "open_session", lambda settings: nullcontext(session))
+    with Bench(session, "optimizer", stage):
+        assert cli_watch.reset_odometry(None, Way()) == 0
+        deadline_s = time.monotonic() + 5.0
+        while not stage.resets and time.monotonic() < deadline_s:
+            time.sleep(0.01)
+    assert stage.resets == 1
+    assert "reset by optimizer-0" in capsys.readouterr().out
+    assert cli_watch.reset_odometry(None, Way()) == EXIT_FAILED

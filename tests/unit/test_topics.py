@@ -22,6 +22,7 @@ from velod.wire.topics import key, parts
         (topics.DONE, {"stage": "flow"}, "velod/rig0/done/flow"),
         (topics.HEALTH, {"worker": "flow-1"}, "velod/rig0/health/flow-1"),
         (topics.ALIVE, {"stage": "flow", "worker": "flow-1"}, "velod/rig0/alive/flow/flow-1"),
+        (topics.ODOMETRY_RESET, {}, "velod/rig0/odometry/reset"),
         (topics.CALIBRATION, {}, "velod/rig0/calibration"),
         (topics.CONFIG, {}, "velod/rig0/config"),
     ],

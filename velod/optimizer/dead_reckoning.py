@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from velod.geometry.so3 import exp, quaternion_from_matrix
+from velod.geometry.so3 import exp, hat, quaternion_from_matrix
 from velod.types import F64, NS_PER_S, Odometry
 
 UP_O = np.array([0.0, 0.0, 1.0])
+NO_TILT = np.zeros((3, 3))
 
 
 class DeadReckoning:
@@ -26,16 +27,16 @@ class DeadReckoning:
         """The velocity is lost: the next one begins a new reckoning."""
         self._t_ns = -1
 
-    def update(self, t_ns: int, v_B: F64, cov: F64, R_LB: F64, g_B: F64) -> Odometry:
+    def update(self, t_ns: int, v_B: F64, cov: F64, R_LB: F64, g_B: F64, tilt_cov: F64 = NO_TILT) -> Odometry:
         """Reckon up to ``t_ns``, later than the last one.
 
         ``v_B`` (3,) m/s with ``cov`` (3, 3); ``R_LB`` (3, 3): attitude in any frame that only the gyroscope carries;
-        ``g_B`` (3,): gravity, as specific force, upwards.
+        ``g_B`` (3,): gravity, as specific force, upwards; ``tilt_cov`` (3, 3): of its direction in B, rad^2.
         """
         if self._t_ns < 0:
             self._begin(t_ns, v_B, R_LB, g_B)
         else:
-            self._go_on(t_ns, v_B, cov, R_LB, g_B)
+            self._go_on(t_ns, v_B, cov, R_LB, g_B, tilt_cov)
         self._t_ns, self._R_LB = t_ns, R_LB
         self._v_O = self._R_OB @ v_B
         q_OB = quaternion_from_matrix(self._R_OB)
@@ -49,7 +50,7 @@ class DeadReckoning:
         self._cov = np.zeros((4, 4))  # of position and heading
         self._R_OB = upright(np.eye(3), g_B)
 
-    def _go_on(self, t_ns: int, v_B: F64, cov: F64, R_LB: F64, g_B: F64) -> None:
+    def _go_on(self, t_ns: int, v_B: F64, cov: F64, R_LB: F64, g_B: F64, tilt_cov: F64) -> None:
         dt = (t_ns - self._t_ns) / NS_PER_S
         # the gyroscope turns, gravity keeps upright
         self._R_OB = upright(self._R_OB @ self._R_LB.T @ R_LB, g_B)
@@ -60,7 +61,10 @@ class DeadReckoning:
         F[:3, 3] = np.cross(UP_O, mean_v_O) * dt
         self._cov = F @ self._cov @ F.T
         # an error that lasts for tau adds up as a random walk of density 2 tau sigma^2
-        self._cov[:3, :3] += self._R_OB @ cov @ self._R_OB.T * (2.0 * self._correlation_s * dt)
+        # as does one of the tilt, which turns the velocity: v x (z x d up)
+        turned = hat(mean_v_O) @ hat(UP_O) @ self._R_OB
+        cov_v_O = self._R_OB @ cov @ self._R_OB.T + turned @ tilt_cov @ turned.T
+        self._cov[:3, :3] += cov_v_O * (2.0 * self._correlation_s * dt)
         self._cov[3, 3] += self._gyro_noise**2 * dt
 
 

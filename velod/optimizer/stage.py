@@ -88,6 +88,11 @@ class OptimizerStage:
         self._now_ns = max(self._now_ns, message.t_ns)
         return self._advance()
 
+    def reset_odometry(self) -> None:
+        """Begin a new dead reckoning with the next valid velocity."""
+        self._reckoning.stop()
+        self._count("odometry.reset")
+
     def _count(self, name: str, by: int = 1) -> None:
         self.counters[name] = self.counters.get(name, 0) + by
 
@@ -263,7 +268,8 @@ class OptimizerStage:
         if not velocity.valid or attitude is None:
             self._reckoning.stop()
             return [velocity]
-        odometry = self._reckoning.update(tau, velocity.v_B, velocity.cov, attitude.R_LB, attitude.up_B)
+        at = (attitude.R_LB, attitude.up_B, attitude.up_cov)
+        odometry = self._reckoning.update(tau, velocity.v_B, velocity.cov, *at)
         return [velocity, replace(odometry, age_ms=velocity.age_ms)]
 
     def _velocity(self, tau: int, attitude: Attitude | None) -> Velocity:

@@ -21,6 +21,7 @@ from velod.wire.topics import (
     HEALTH,
     IMU_SENSOR,
     ODOMETRY,
+    ODOMETRY_RESET,
     PRIME,
     TOPICS,
     VELOCITY,
@@ -34,7 +35,7 @@ SERVER: Final = "server"
 
 LOOPBACK_INTERFACES: Final = ("lo", "lo0")
 _SENSOR = (EVENTS, IMU_SENSOR)
-_QUERIES = (CONFIG, CALIBRATION)
+_QUERIES = (CONFIG, CALIBRATION, ODOMETRY_RESET)
 _ANSWERS = (ALIVE, *_QUERIES)
 _STREAMS = tuple(topic for topic in TOPICS.values() if topic not in _ANSWERS)
 # A driver reports its health, under no other name than one of a driver.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -16,7 +17,7 @@ from velod.runtime.dispatching import BatchDispatch
 from velod.runtime.inbox import Item
 from velod.runtime.measure import SensorClock
 from velod.runtime.shell import WorkerShell
-from velod.runtime.stages import Limited, Stage
+from velod.runtime.stages import Limited, Reckoning, Stage
 from velod.runtime.succession import Succession, Turn
 from velod.types import DepthBatch, Done, EventBatch, FlowBatch, ImuSamples, Message, Odometry, StereoBatch, Velocity
 from velod.wire import Envelope, decode
@@ -30,6 +31,7 @@ from velod.wire.topics import (
     IMU,
     IMU_SENSOR,
     ODOMETRY,
+    ODOMETRY_RESET,
     VELOCITY,
     Topic,
     key,
@@ -193,7 +195,20 @@ class OptimizerShell(WorkerShell):
         self.listen_to_tokens(stack, stage=self.stage_name)
         for topic in (VELOCITY, ODOMETRY):
             self._listen_to_peers(stack, topic)
+        self._answer_resets(stack)
         super().subscribe(stack)
+
+    def _answer_resets(self, stack: ExitStack) -> None:
+        """Every optimizer hears of a reset, whether it leads or stands by: they go on reckoning alike."""
+        self.inbox.add_source(ODOMETRY_RESET.name, self.depth, urgent=True)
+        at = key(ODOMETRY_RESET, self.rig)
+
+        def asked(query: zenoh.Query) -> None:
+            with query:
+                self.inbox.put(ODOMETRY_RESET.name, at, b"")
+                query.reply(at, json.dumps({"reset_by": self.worker}))
+
+        stack.enter_context(self.session.declare_queryable(at, asked))
 
     def _listen_to_peers(self, stack: ExitStack, topic: Topic) -> None:
         self.inbox.add_source(topic.name, self.depth, urgent=True)
@@ -214,7 +229,11 @@ class OptimizerShell(WorkerShell):
             self._publish_turns(self._succession.left(token["worker"], time.monotonic()))
 
     def take_other(self, item: Item) -> bool:
-        """What another optimizer has published."""
+        """What another optimizer has published, and resets of the odometry."""
+        if item.source == ODOMETRY_RESET.name:
+            if isinstance(self.stage, Reckoning):
+                self.stage.reset_odometry()
+            return True
         if item.source not in self._PEERS:
             return False
         message = decode(item.data, self._PEERS[item.source]).message

@@ -34,6 +34,15 @@ class Limited(Protocol):
     budget: Budget
 
 
+@runtime_checkable
+class Reckoning(Protocol):
+    """A stage that integrates the velocity, and can be told to begin anew."""
+
+    def reset_odometry(self) -> None:
+        """Begin a new dead reckoning with the next valid velocity."""
+        ...
+
+
 _CLASSES = {
     "ingest": ("velod.ingest.stage", "IngestStage"),
     "flow": ("velod.flow.stage", "FlowStage"),

@@ -40,6 +40,7 @@ DEPTH = Topic("depth", "velod/{rig}/depth", types.DepthBatch, 50.0, 0.5, _STREAM
 IMU = Topic("imu", "velod/{rig}/imu", types.ImuSamples, 250.0, 0.5, _STREAM)
 VELOCITY = Topic("velocity", "velod/{rig}/velocity", types.Velocity, 75.0, 0.2, Qos("real_time", 8))
 ODOMETRY = Topic("odometry", "velod/{rig}/odometry", types.Odometry, 75.0, 0.0, Qos("data_high", 8))
+ODOMETRY_RESET = Topic("odometry_reset", "velod/{rig}/odometry/reset", None, 0.0, 0.0)
 DONE = Topic("done", "velod/{rig}/done/{stage}", types.Done, 50.0, 0.0, Qos("data_high", 256))
 HEALTH = Topic("health", "velod/{rig}/health/{worker}", types.Health, 1.0, 3.0, Qos("background", 64))
 ALIVE = Topic("alive", "velod/{rig}/alive/{stage}/{worker}", None, 0.0, 0.0)
@@ -59,6 +60,7 @@ TOPICS: dict[str, Topic] = {
         IMU,
         VELOCITY,
         ODOMETRY,
+        ODOMETRY_RESET,
         DONE,
         HEALTH,
         ALIVE,
