@@ -77,6 +77,8 @@ def evaluate_files(
 ) -> int:
     """Judge recordings against the truth that they hold. Raises RunFailed if one yields no valid velocity."""
     settings = settings_of(config, options.calibration)
+    if settings.optimizer.frame != "imu":
+        raise ValueError("optimizer.frame: must be 'imu' to be judged: the truth in recordings is the IMU's")
     rows, failed = [], []
     for file in files:
         played = play(settings, file, options)
@@ -178,7 +180,7 @@ def _speed_of(published: list[Published]) -> float:
 def _metrics(played: Played) -> Metrics | None:
     from velod.eval.metrics import evaluate
 
-    if played.recording.truth is None:
+    if played.recording.truth is None or any(v.frame != "imu" for v in played.velocities):
         return None
     return evaluate(played.velocities, played.recording.truth, played.recording.t_start_ns)
 
@@ -194,7 +196,7 @@ def _drift_percent(played: Played) -> float | None:
     from velod.eval.dead_reckoning import dead_reckoning
 
     recording = played.recording
-    if recording.truth is None:
+    if recording.truth is None or any(v.frame != "imu" for v in played.velocities):
         return None
     track = dead_reckoning(played.velocities, recording.imu, recording.truth)
     return None if track is None else track.drift_percent

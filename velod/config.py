@@ -178,6 +178,9 @@ class DepthSettings:
 class OptimizerSettings:
     workers: int = _f(1, "processes: one leads, the others stand by to take over within 0.1 s", lo=1, hi=8)
     output_hz: float = _f(75.0, "velocities per second of sensor time", lo=1.0, hi=1000.0)
+    frame: str = _f(
+        "imu", "whose velocity is published: 'imu', 'camera' (the left one), or one of the calibration's frames"
+    )
     spline: str = _f(
         "error",
         "what the spline models: 'error' of the IMU-integrated velocity, or the 'velocity' itself (the paper)",

@@ -41,6 +41,7 @@ class Calibration:
     t_RL: F64  # (3,), m; (-baseline, 0, 0) for a rectified pair
     T_cam_imu: F64 = field(default_factory=lambda: np.eye(4))  # (4, 4)
     time_offset_s: float = 0.0
+    frames: dict[str, F64] = field(default_factory=dict)  # by name: T_imu_frame (4, 4), p_B = T p_frame, m
 
     def to_tree(self) -> dict[str, Any]:
         """Plain numbers, strings and lists; ``from_tree`` reads them back."""
@@ -51,15 +52,16 @@ class Calibration:
             "t_RL": self.t_RL.tolist(),
             "T_cam_imu": self.T_cam_imu.tolist(),
             "time_offset_s": self.time_offset_s,
+            "frames": {name: T.tolist() for name, T in self.frames.items()},
         }
 
     @staticmethod
     def from_tree(tree: dict[str, Any], source: str) -> Calibration:
-        """The inverse of ``to_tree``. ``model``, ``dist``, ``T_cam_imu`` and ``time_offset_s`` may be left out.
+        """The inverse of ``to_tree``. What is not of the cameras' poses and pinholes may be left out.
 
         Raises CalibrationError naming ``source``, the field and the reason.
         """
-        _refuse_unknown(tree, ("left", "right", "R_RL", "t_RL", "T_cam_imu", "time_offset_s"), source)
+        _refuse_unknown(tree, ("left", "right", "R_RL", "t_RL", "T_cam_imu", "time_offset_s", "frames"), source)
         return checked(
             Calibration(
                 left=_camera(_get(tree, "left", source), f"{source}: left"),
@@ -68,6 +70,7 @@ class Calibration:
                 t_RL=_array(_get(tree, "t_RL", source), (3,), f"{source}: t_RL"),
                 T_cam_imu=_array(tree.get("T_cam_imu", np.eye(4).tolist()), (4, 4), f"{source}: T_cam_imu"),
                 time_offset_s=_number(tree.get("time_offset_s", 0.0), f"{source}: time_offset_s"),
+                frames=_frames(tree.get("frames", {}), f"{source}: frames"),
             ),
             source,
         )
@@ -99,6 +102,8 @@ def checked(calib: Calibration, source: str) -> Calibration:
     if not np.array_equal(calib.T_cam_imu[3], [0.0, 0.0, 0.0, 1.0]):
         raise CalibrationError(f"{source}: T_cam_imu: last row must be 0 0 0 1, got {calib.T_cam_imu[3].tolist()}")
     _check_rotation(calib.T_cam_imu[:3, :3], f"{source}: T_cam_imu")
+    for name, T in calib.frames.items():
+        _check_rotation(T[:3, :3], f"{source}: frames: {name}")
     if not abs(calib.time_offset_s) <= MAX_TIME_OFFSET_S:
         raise CalibrationError(
             f"{source}: time_offset_s: must be within {MAX_TIME_OFFSET_S:g} s of zero, got {calib.time_offset_s:g}"
@@ -240,6 +245,12 @@ def _check_ros_baseline(calib: Calibration, right: dict[str, Any], source: str) 
         raise CalibrationError(
             f"{source}: T_right_left: baseline {b_T:.4g} m disagrees with the projection matrix's {b_P:.4g} m"
         )
+
+
+def _frames(tree: Any, where: str) -> dict[str, F64]:
+    if not isinstance(tree, dict):
+        raise CalibrationError(f"{where}: must be a map from names to 4x4 matrices, got {tree!r}")
+    return {str(name): _array(value, (4, 4), f"{where}: {name}") for name, value in tree.items()}
 
 
 def _transform(tree: dict[str, Any], key: str, source: str) -> F64:

@@ -19,6 +19,10 @@ class Attitude:
     up_B: F64  # (3,) unit vector against gravity
     up_cov: F64  # (3, 3) of up_B, rad^2: rank 2, nothing along up_B
 
+    def seen_from(self, R_FB: F64) -> Attitude:
+        """The same of another frame F of the body, in the place of B."""
+        return Attitude(self.R_LB @ R_FB.T, R_FB @ self.up_B, R_FB @ self.up_cov @ R_FB.T)
+
 
 def carry(p: Preintegration, R_LB: F64, g_L: F64, cov: F64) -> Attitude:
     """The attitude at the end of ``p`` from R_LB, gravity g_L (upwards) and cov (6, 6) of [b_w, g_L] before."""

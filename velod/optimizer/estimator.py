@@ -15,6 +15,7 @@ from velod.optimizer import attitude, degeneracy, flow_equation, inertial_residu
 from velod.optimizer.attitude import Attitude
 from velod.optimizer.consistency import Consistency
 from velod.optimizer.flow_equation import BIN_NS, RIDGE, Bins, Fit, Measured, Rows
+from velod.optimizer.frame import Rate
 from velod.optimizer.inertial import InertialMemory
 from velod.optimizer.interval import Interval
 from velod.optimizer.preintegration import Preintegration, preintegrate
@@ -196,6 +197,18 @@ class Estimator:
         sigma = max(self._still_sigma(), RESTING_SIGMA)
         gain = cov @ np.linalg.inv(cov + np.eye(3) * sigma**2)
         return v - gain @ v, cov - gain @ cov
+
+    def rate(self, t_ns: int) -> Rate | None:
+        """Angular velocity at ``t_ns`` for a velocity that ``output`` gave."""
+        head = self.head
+        if head is None or not self.memory.covers(head.t_ns, t_ns):
+            return None
+        p = self._carry(head, t_ns)[0]
+        J = inertial_residual.carried_jacobian(p, self._carry(head, t_ns)[1], head.R_LB)
+        w_B, share = self.memory.rate_at(t_ns)
+        noise_cov = np.eye(3) * self._imu.gyro_noise**2 * share
+        factor = self.consistency.factor
+        return Rate(w_B - head.b_w, noise_cov, head.cov[6:9, 6:9] * factor, J @ head.cov[:, 6:9] * factor)
 
     def attitude(self, t_ns: int) -> Attitude | None:
         """Which way is up at ``t_ns``, carried there from the head by the gyroscope; None while that is unknown."""

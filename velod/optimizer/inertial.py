@@ -92,6 +92,14 @@ class InertialMemory:
         )
         return R, s, w
 
+    def rate_at(self, t_ns: int) -> tuple[F64, float]:
+        """The gyroscope (3,) at ``t_ns`` between two samples, and its variance over its density's square, 1/s."""
+        k = min(max(int(np.searchsorted(self.t_ns, t_ns, side="right")) - 1, 0), self._n - 2)
+        span_ns = int(self._t[k + 1] - self._t[k])
+        s = (t_ns - int(self._t[k])) / span_ns
+        w: F64 = (1.0 - s) * self._gyro[k] + s * self._gyro[k + 1]
+        return w, ((1.0 - s) ** 2 + s**2) / (span_ns * 1e-9)
+
     def shift(self, offset: F64) -> None:
         """Count s_L from another origin: s_L + offset."""
         self._s[: self._n_integrated] += offset

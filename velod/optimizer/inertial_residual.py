@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from velod.geometry.so3 import hat
 from velod.optimizer.preintegration import Preintegration
 from velod.types import F64
 
@@ -19,6 +20,13 @@ def carry(p: Preintegration, v_B: F64, R_LB: F64, g_L: F64, cov: F64) -> tuple[F
         p.R_gamma, p.beta, p.d_theta_d_bw, p.d_beta_d_ba, p.d_beta_d_bw, p.cov, p.dt, v_B, R_LB, g_L, cov, v, out
     )  # fmt: skip
     return v, out
+
+
+def carried_jacobian(p: Preintegration, v_B: F64, R_LB: F64) -> F64:
+    """d v_B / d [v_B, b_a, b_w, g_L] (3, 12) of ``carry``, at the velocity ``v_B`` (3,) after it."""
+    R_T = p.R_gamma.T
+    by_bias = R_T @ p.d_beta_d_bw + hat(v_B) @ p.d_theta_d_bw
+    return np.hstack([R_T, R_T @ p.d_beta_d_ba, by_bias, -p.dt * (R_LB @ p.R_gamma).T])
 
 
 def linearise(

@@ -19,6 +19,7 @@ from velod.optimizer.attitude import Attitude
 from velod.optimizer.calibration_check import CalibrationCheck
 from velod.optimizer.dead_reckoning import DeadReckoning
 from velod.optimizer.estimator import Estimator
+from velod.optimizer.frame import output_frame
 from velod.optimizer.parts import Parts, batch_seq
 from velod.types import F64, NS_PER_S, DepthBatch, FlowBatch, ImuSamples, Odometry, TrackingState, Velocity
 
@@ -45,6 +46,7 @@ class OptimizerStage:
 
     def __init__(self, settings: Settings, calibration: Calibration) -> None:
         self._settings, self._calibration = settings, calibration
+        self._frame = output_frame(settings.optimizer.frame, calibration)
         self._hz = settings.optimizer.output_hz
         wait = settings.optimizer.max_wait_ms
         self._max_wait_ns = int(wait * 1e6) if np.isfinite(wait) else None
@@ -264,6 +266,8 @@ class OptimizerStage:
     def _put_out(self, tau: int) -> list[Velocity | Odometry]:
         """The velocity at ``tau``; with its dead reckoning where it is valid."""
         attitude = self._estimator.attitude(tau)
+        if attitude is not None and not self._frame.is_imu:
+            attitude = attitude.seen_from(self._frame.R_FB)
         velocity = self._velocity(tau, attitude)
         if not velocity.valid or attitude is None:
             self._reckoning.stop()
@@ -279,10 +283,14 @@ class OptimizerStage:
         else:
             v, cov = predicted
         weak_B = self._estimator.degenerate(tau)
+        if not self._frame.is_imu and (rate := self._estimator.rate(tau)) is not None:
+            v, cov = self._frame.velocity(v, cov, rate)
+            weak_B = weak_B @ self._frame.R_FB.T
         state, reason, valid = self._judge(tau, v, cov, weak_B)
         velocity = Velocity(
-            self._seq, tau, v, cov, valid, state, reason, *self._newest, age_ms=(self._now_ns - tau) * 1e-6
-        )
+            self._seq, tau, v, cov, valid, state, reason, *self._newest,
+            age_ms=(self._now_ns - tau) * 1e-6, frame=self._frame.name,
+        )  # fmt: skip
         if len(weak_B):
             velocity = replace(
                 velocity, degenerate=len(weak_B), degenerate_B=np.vstack([weak_B, np.zeros((3, 3))])[:3]
