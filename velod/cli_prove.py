@@ -23,6 +23,7 @@ def add_actions(actions: Any) -> None:
     fleet.add_argument("--rigs", type=int, default=100, help="how many (default 100)")
     fleet.add_argument("--hz", type=float, default=75.0, help="velocities per second of each (default 75)")
     fleet.add_argument("--seconds", type=float, default=10.0, help="default 10")
+    fleet.add_argument("--tls", action="store_true", help="with certificates, as between hosts")
     fleet.set_defaults(command=_fleet)
     soak = actions(
         "soak", "a velod at work for long, its workers killed and stopped at random: memory, files, latency"
@@ -95,7 +96,7 @@ def _fleet(args: argparse.Namespace) -> int:
     from velod.prove.fleet import FleetError, run_fleet
 
     try:
-        fleet = run_fleet(args.rigs, args.hz, args.seconds)
+        fleet = run_fleet(args.rigs, args.hz, args.seconds, tls=args.tls)
     except FleetError as e:
         raise RunFailed(str(e)) from None
     print(

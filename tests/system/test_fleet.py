@@ -12,9 +12,9 @@ pytestmark = pytest.mark.system
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads CPU times from /proc")
-def test_thirty_rigs_are_heard_by_one_consumer_each_at_its_rate() -> None:
+def test_twenty_rigs_are_heard_by_one_consumer_each_at_its_rate() -> None:
     """Few enough for a machine that is busy; `velod prove fleet` has hundreds."""
-    fleet = run_fleet(rigs=30, hz=25.0, seconds=3.0)
+    fleet = run_fleet(rigs=20, hz=15.0, seconds=3.0, tls=True)
     assert fleet.silent == 0
     assert fleet.share > 0.97
     assert fleet.latency_p50_ms < 20.0

@@ -18,6 +18,7 @@ from threading import Event
 import numpy as np
 import pytest
 
+from velod.cli import main
 from velod.client import Listener, VelocityClient
 from velod.config import Settings, ZenohSettings
 from velod.io import open_recording
@@ -82,7 +83,7 @@ def velocity(seq: int, speed: float) -> Velocity:
 
 
 def test_on_a_robot_with_a_compute_host_workers_join_through_the_router(
-    slanted: Path, keys: Path, tmp_path: Path
+    slanted: Path, keys: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     files = host("robot", Site(keys=str(keys)), tmp_path, *(ports := free_ports(2)))
     recording = open_recording(slanted)
@@ -102,8 +103,11 @@ def test_on_a_robot_with_a_compute_host_workers_join_through_the_router(
             robot.step()
             compute.step()
             time.sleep(0.02)
+        assert main(["top", "--once", "--connect", f"tls/localhost:{ports[1]}", "--keys", str(keys)]) == 0
         play(driver, "rig0", (p for p in recording.packets() if p.t_ns < 1_200_000_000), 0.5, Event())
         speeds = [v.v_B[0] for v in iter(lambda: client.receive(0.5), None)]
+    table = capsys.readouterr().out
+    assert all(worker in table for worker in ("ingest-0", "flow-0", "depth-0", "optimizer-0")), "as operator"
     assert len(speeds) >= 5
     assert np.median(speeds) == pytest.approx(-3.125, abs=0.2)
 

@@ -9,6 +9,7 @@ import sys
 import time
 from contextlib import ExitStack
 from dataclasses import dataclass
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from velod.client import Listener
 from velod.config import ZenohSettings
 from velod.prove.besieged import free_port
 from velod.prove.processes import cpu_s, resident_mib
+from velod.runtime.certificates import make_keys
 from velod.wire.topics import ANY_RIG, VELOCITY
 
 RIGS_PER_PROCESS = 100
@@ -50,32 +52,54 @@ class FleetError(RuntimeError):
     """The processes did not come up; one line."""
 
 
-def run_fleet(rigs: int, hz: float, seconds: float) -> Fleet:
+def run_fleet(rigs: int, hz: float, seconds: float, *, tls: bool = False) -> Fleet:
     """A router, processes of simulated rigs with a session each, and a consumer of ``velod/*/velocity`` here.
 
-    Raises FleetError.
+    ``tls``: with certificates and the list of what each may do, as between hosts. Raises FleetError.
     """
-    port = free_port()
-    endpoint = f"tcp/127.0.0.1:{port}"
     with ExitStack() as stack:
-        router = _start(stack, ["velod.cli", "router", "--port", str(port)])
+        way = _tls(stack) if tls else _plain()
+        router = _start(stack, ["velod.cli", "router", *way.router])
         assert router.stderr is not None
         if "up" not in (said := router.stderr.readline()):
             raise FleetError(f"the router is not up: {said.strip()}")
-        listener = stack.enter_context(Listener(ANY_RIG, (VELOCITY,), ZenohSettings(connect=endpoint)))
+        listener = stack.enter_context(Listener(ANY_RIG, (VELOCITY,), way.consumer))
         groups = []
         for first in range(0, rigs, RIGS_PER_PROCESS):
             count = min(RIGS_PER_PROCESS, rigs - first)
-            groups.append(_start(stack, ["velod.prove.fleet_rigs", endpoint, str(first), str(count), f"{hz:g}"]))
+            numbers = [str(first), str(count), f"{hz:g}"]
+            groups.append(_start(stack, ["velod.prove.fleet_rigs", way.consumer.connect, *numbers, *way.rigs]))
         for group in groups:
-            assert group.stdout is not None and group.stdin is not None
+            assert group.stdout is not None
             if group.stdout.readline() != "connected\n":
-                raise FleetError(f"{RIGS_PER_PROCESS} rigs did not connect: {group.poll()}")
+                raise FleetError(f"rigs did not connect; exit code {group.poll()}")
         for group in groups:
             assert group.stdin is not None
             group.stdin.write("go\n")
             group.stdin.flush()
         return _measure(listener, rigs, hz, seconds, router.pid, [group.pid for group in groups])
+
+
+@dataclass(frozen=True, slots=True)
+class _Way:
+    """How router, rigs and consumer find each other."""
+
+    router: list[str]
+    rigs: list[str]
+    consumer: ZenohSettings
+
+
+def _plain() -> _Way:
+    port = free_port()
+    return _Way(["--port", str(port)], [], ZenohSettings(connect=f"tcp/127.0.0.1:{port}"))
+
+
+def _tls(stack: ExitStack) -> _Way:
+    keys, endpoint = stack.enter_context(TemporaryDirectory(prefix="velod-fleet-")), f"tls/127.0.0.1:{free_port()}"
+    make_keys(keys)
+    guard = ["--keys", keys]
+    consumer = ZenohSettings(connect=endpoint, keys=keys, role="consumer")
+    return _Way(["--port", str(free_port()), "--listen", endpoint, *guard], guard, consumer)
 
 
 def _measure(listener: Listener, rigs: int, hz: float, seconds: float, router: int, groups: list[int]) -> Fleet:

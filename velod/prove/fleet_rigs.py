@@ -10,10 +10,12 @@ import sys
 import threading
 import time
 from contextlib import ExitStack
+from pathlib import Path
 
 import numpy as np
 
 from velod.config import ZenohSettings
+from velod.runtime.key_paths import KeyPaths
 from velod.runtime.outlet import Outlet
 from velod.runtime.session import client_tree, open_config, to_config
 from velod.runtime.worker import stop_on_signals
@@ -28,12 +30,13 @@ def main() -> None:
     parser.add_argument("first", type=int)
     parser.add_argument("count", type=int)
     parser.add_argument("hz", type=float)
+    parser.add_argument("--keys", help="folder with a worker's certificate, for a tls/ endpoint")
     args = parser.parse_args()
     stop = stop_on_signals()
     with ExitStack() as stack:
         outlets = []
         for rig in range(args.first, args.first + args.count):
-            tree = client_tree(args.endpoint)
+            tree = client_tree(args.endpoint, KeyPaths(Path(args.keys)) if args.keys else None, "worker")
             tree["transport"]["shared_memory"]["enabled"] = False  # as from another host
             session = stack.enter_context(open_config(to_config(tree), ZenohSettings(connect=args.endpoint)))
             outlets.append(stack.enter_context(Outlet(session, f"rig{rig}")))
