@@ -24,6 +24,9 @@ RING_ROW, RING_COLUMN = np.argwhere(
     np.pad(np.zeros((PATCH, PATCH)), (WIDE - PATCH) // 2, constant_values=1.0)
 ).T.copy()
 """Where in the 7x7 the neighbours around the 5x5 are, (24,) each, row-major."""
+RING_AT = RING_ROW * WIDE + RING_COLUMN
+INNER_AT = np.setdiff1d(np.arange(WIDE_SIZE), RING_AT)
+"""Where in the flat 7x7 the neighbours around the 5x5 are, (24,), and the 5x5, (25,)."""
 MIN_DETERMINANT = 1e-3
 """A fit is near-singular when the determinant of the moments is below this share of the variances' product."""
 
@@ -36,6 +39,10 @@ PlaneFit = tuple[int, float, float, float, float, float, float, float]
 
 DX, DY = (offset.ravel().astype(np.float64) for offset in np.mgrid[-HALF : HALF + 1, -HALF : HALF + 1][::-1])
 """Of the neighbours from the centre, px, row-major."""
+WIDE_DX, WIDE_DY = (
+    offset.ravel().astype(np.float64) for offset in np.mgrid[-REACH : REACH + 1, -REACH : REACH + 1][::-1]
+)
+"""Likewise of the 7x7."""
 BIT = 1 << np.arange(SIZE)
 ALL = int(BIT.sum())
 """Sets of neighbours are the bits of a number."""
@@ -115,7 +122,7 @@ def fit_plane(age: F64, reject_px: float, rejections: int, min_neighbours: int) 
     return 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
 
 
-@njit(cache=True, nogil=True)
+@njit(fastmath=ANY_ORDER, cache=True, nogil=True, error_model="numpy")
 def widen_plane(fit: PlaneFit, age: F64, reject_px: float, max_rms_px: float) -> tuple[PlaneFit, float]:
     """The plane through those of the 7x7 neighbours that lie within ``reject_px`` of ``fit``.
 
@@ -127,27 +134,26 @@ def widen_plane(fit: PlaneFit, age: F64, reject_px: float, max_rms_px: float) ->
     _, gx, gy, t0, _, _, _, _ = fit
     limit = reject_px * math.sqrt(gx * gx + gy * gy)
     # Moments of the residuals: what the slope and the time of the new plane differ by follows from them.
-    i = n = x = y = xx = xy = yy = 0
+    n = x = y = xx = xy = yy = 0.0
     r = xr = yr = rr = xxr = xyr = yyr = 0.0
-    for dy in range(-REACH, REACH + 1):
-        for dx in range(-REACH, REACH + 1):
-            residual = -age[i] - t0 - gx * dx - gy * dy
-            k = int(age[i] > 0.0) & int(abs(residual) <= limit)
-            n += k
-            x += k * dx
-            y += k * dy
-            xx += k * dx * dx
-            xy += k * dx * dy
-            yy += k * dy * dy
-            kr = k * residual
-            r += kr
-            xr += dx * kr
-            yr += dy * kr
-            rr += kr * residual
-            xxr += dx * dx * kr
-            xyr += dx * dy * kr
-            yyr += dy * dy * kr
-            i += 1
+    for i in range(WIDE_SIZE):
+        dx, dy = WIDE_DX[i], WIDE_DY[i]
+        residual = -age[i] - t0 - gx * dx - gy * dy
+        k = 1.0 if (age[i] > 0.0) & (abs(residual) <= limit) else 0.0
+        n += k
+        x += k * dx
+        y += k * dy
+        xx += k * dx * dx
+        xy += k * dx * dy
+        yy += k * dy * dy
+        kr = k * residual
+        r += kr
+        xr += dx * kr
+        yr += dy * kr
+        rr += kr * residual
+        xxr += dx * dx * kr
+        xyr += dx * dy * kr
+        yyr += dy * dy * kr
     if n < 4:
         return fit, 0.0
     mx, my, mr = x / n, y / n, r / n
@@ -167,7 +173,7 @@ def widen_plane(fit: PlaneFit, age: F64, reject_px: float, max_rms_px: float) ->
     # On the full grid x^2, x y and y^2 are orthogonal to the plane (but for their means) and to each other.
     a, b, c = (xxr - 4.0 * r) / 588.0, (yyr - 4.0 * r) / 588.0, xyr / 784.0
     bend = abs(gx * gx * a + gy * gy * b + gx * gy * c) / slope2
-    return (n, gx, gy, t0 + mr - hx * mx - hy * my, rms, syy / det, -sxy / det, sxx / det), bend
+    return (int(n), gx, gy, t0 + mr - hx * mx - hy * my, rms, syy / det, -sxy / det, sxx / det), bend
 
 
 @njit(cache=True, nogil=True)

@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numba import njit
 
-from velod.events.plane_fit import RING_COLUMN, RING_ROW, SIZE, fit_plane, honest_rms, widen_plane
-from velod.types import F32, F64, I64, PATCH, RING, U16, U32, WIDE
+from velod.events.plane_fit import INNER_AT, RING_AT, SIZE, WIDE_SIZE, fit_plane, honest_rms, widen_plane
+from velod.types import F32, F64, I64, RING, U16, U32
 
 REFUSALS = ("unfit", "rms", "speed", "unrectified")
 """Why an event gets no flow: no plane (too few neighbours or singular), rms gate, speed gate, outside the lens."""
@@ -50,7 +50,7 @@ def fit_flows(
     Writes for each of the m flows its position in the batch to ``index`` and (x, y, nx, ny, speed, sigma) in
     rectified px and px/s to ``flow`` (n, 6); adds the others to ``refused`` by cause. Returns m.
     """
-    age, wide = np.empty(SIZE, np.float64), np.empty((WIDE, WIDE), np.float64)
+    age, wide = np.empty(SIZE, np.float64), np.empty(WIDE_SIZE, np.float64)
     turn = np.empty(x.size, np.float64)
     m = 0
     for i in range(x.size):
@@ -62,12 +62,14 @@ def fit_flows(
             continue
         bend = 0.0
         if len(ring) > 0:
-            wide[1:-1, 1:-1] = age.reshape(PATCH, PATCH)
+            for j in range(SIZE):
+                wide[INNER_AT[j]] = age[j]
             for j in range(RING):
-                wide[RING_ROW[j], RING_COLUMN[j]] = ring[i, j] * 1e-9
-            fit, bend = widen_plane(fit, wide.reshape(-1), reject_px, max_rms_px)
+                wide[RING_AT[j]] = ring[i, j] * 1e-9
+            fit, bend = widen_plane(fit, wide, reject_px, max_rms_px)
         n, gx, gy, _, rms, qxx, qxy, qyy = fit
-        if not rms < max_rms_px * math.hypot(gx, gy):
+        slope = math.sqrt(gx * gx + gy * gy)
+        if not rms < max_rms_px * slope:
             refused[_RMS] += 1
             continue
         r, c = y[i], x[i]
@@ -76,7 +78,7 @@ def fit_flows(
         # grad_T is a covector: it transforms by the inverse transpose of the undistortion's Jacobian.
         tx = a * gx + b * gy
         ty = d * gx + e * gy
-        grad_T = math.hypot(tx, ty)
+        grad_T = math.sqrt(tx * tx + ty * ty)
         if not grad_T < math.inf:
             refused[_UNRECTIFIED] += 1
             continue
@@ -86,10 +88,10 @@ def fit_flows(
         # Eq. 6: the normal flow is grad_T / |grad_T|^2.
         nx, ny, speed = tx / grad_T, ty / grad_T, 1.0 / grad_T
         # Variances of the slope along n and across it, as shares of the slope: errors of speed and of direction.
-        sigma_t = INFLATION * honest_rms(n, rms, math.hypot(gx, gy))
+        sigma_t = INFLATION * honest_rms(n, rms, slope)
         along = math.hypot(
             speed * sigma_t * _deviation(qxx, qxy, qyy, a * nx + d * ny, b * nx + e * ny),
-            BEND_PX * bend / math.hypot(gx, gy),
+            BEND_PX * bend / slope,
         )
         across = speed * sigma_t * _deviation(qxx, qxy, qyy, d * nx - a * ny, e * nx - b * ny)
         if benosman:

@@ -10,20 +10,18 @@ import numpy as np
 
 from velod.config import Settings
 from velod.events.causal import ages_of, all_open, enter_and_select
-from velod.events.plane_fit import RING_COLUMN, RING_ROW, WIDE_SIZE
+from velod.events.plane_fit import INNER_AT, RING_AT, WIDE_SIZE
 from velod.events.sae import new_surface
 from velod.events.selection import cell_side_px
 from velod.ingest.batch import OpenBatch
 from velod.ingest.stream import CameraStream
-from velod.types import U8, U16, U32, WIDE, EventBatch
+from velod.types import U8, U16, U32, EventBatch
 
 MAX_SELECTED = 65_535
 """Events that one batch can carry (uint16 positions); a batch that is full selects no more."""
 MAX_AGE_NS = 2**32 - 1
 MIDDLE = WIDE_SIZE // 2
-RING = RING_ROW * WIDE + RING_COLUMN
-INNER = np.setdiff1d(np.arange(WIDE_SIZE), RING)
-"""Where in a 7x7 the event, the neighbours around the 5x5 and the 5x5 are."""
+"""Where in a 7x7 the event is."""
 
 
 class Slices:
@@ -126,6 +124,6 @@ class Slices:
             self._t_start_ns = batch.t_start_ns
         return EventBatch(
             self._seq, t_end_ns, self._t_start_ns, n_events,
-            x.astype(np.uint16), y.astype(np.uint16), wide[:, MIDDLE].copy(), p.astype(np.uint8), wide[:, INNER],
-            batch_seq, first, wide[:, RING],
+            x.astype(np.uint16), y.astype(np.uint16), wide[:, MIDDLE].copy(), p.astype(np.uint8), wide[:, INNER_AT],
+            batch_seq, first, wide[:, RING_AT],
         )  # fmt: skip
