@@ -89,6 +89,22 @@ def test_a_tilt_error_turns_the_way_and_its_covariance_says_so():
     assert abs(out.cov[0, 0]) < 1e-9
 
 
+def test_an_origin_with_an_uncertain_up_has_an_uncertain_heading():
+    """B lies on its side, up known to 0.1 rad: headings of origins drawn so scatter as the covariance says."""
+    rng, up, sigma, headings = np.random.default_rng(4), np.array([0.0, -1.0, 0.0]), 0.1, []
+    for _ in range(2000):
+        wrong = upright(np.eye(3), up + np.array([1.0, 0.0, 1.0]) * rng.normal(size=3) * sigma)
+        forward = (wrong @ upright(np.eye(3), up).T)[:, 0]
+        headings.append(np.arctan2(forward[1], forward[0]))
+    reckoning = DeadReckoning(1.0, 1e-9)
+    tilt = np.diag([sigma**2, 0.0, sigma**2])
+    for k in range(101):
+        out = reckoning.update(
+            k * 10_000_000, np.array([1.0, 0.0, 0.0]), np.zeros((3, 3)), np.eye(3), up, tilt if k == 0 else tilt * 0
+        )
+    assert np.isclose(np.sqrt(out.cov[1, 1]), np.std(headings) * 1.0, rtol=0.1)
+
+
 def test_a_reset_begins_a_new_reckoning_at_zero():
     stage = OptimizerStage(from_tree({}), CALIBRATION)
     stream = messages(FLIGHT, 1.5)

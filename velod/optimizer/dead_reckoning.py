@@ -34,7 +34,7 @@ class DeadReckoning:
         ``g_B`` (3,): gravity, as specific force, upwards; ``tilt_cov`` (3, 3): of its direction in B, rad^2.
         """
         if self._t_ns < 0:
-            self._begin(t_ns, v_B, R_LB, g_B)
+            self._begin(t_ns, v_B, R_LB, g_B, tilt_cov)
         else:
             self._go_on(t_ns, v_B, cov, R_LB, g_B, tilt_cov)
         self._t_ns, self._R_LB = t_ns, R_LB
@@ -44,11 +44,14 @@ class DeadReckoning:
         cov_p = self._cov[:3, :3].copy()
         return Odometry(self._seq - 1, t_ns, self._origin_t_ns, self._p_O.copy(), q_OB, cov_p, self._distance_m)
 
-    def _begin(self, t_ns: int, v_B: F64, R_LB: F64, g_B: F64) -> None:
+    def _begin(self, t_ns: int, v_B: F64, R_LB: F64, g_B: F64, tilt_cov: F64) -> None:
         self._origin_t_ns = t_ns
         self._p_O, self._distance_m = np.zeros(3), 0.0
-        self._cov = np.zeros((4, 4))  # of position and heading
         self._R_OB = upright(np.eye(3), g_B)
+        self._cov = np.zeros((4, 4))  # of position and heading
+        # which heading is zero follows from up: turning up by d about the axis to z turns it by d tan(angle / 2)
+        up_z = float(g_B[2] / np.linalg.norm(g_B))
+        self._cov[3, 3] = 0.5 * float(np.trace(tilt_cov)) * (1.0 - up_z) / max(1.0 + up_z, 1e-3)
 
     def _go_on(self, t_ns: int, v_B: F64, cov: F64, R_LB: F64, g_B: F64, tilt_cov: F64) -> None:
         dt = (t_ns - self._t_ns) / NS_PER_S
