@@ -214,7 +214,7 @@ first steps:
     return parser
 
 
-_BENCHES = ("all", "flow", "depth", "solve", "codec", "pipeline")
+_BENCHES = ("all", "flow", "depth", "solve", "codec", "pipeline", "hop")
 _Commands = argparse._SubParsersAction  # argparse has no public name for it
 
 

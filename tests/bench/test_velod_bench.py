@@ -23,6 +23,7 @@ NAMES = {
     "solve": ["solve.window", "output.imu_rate"],
     "codec": ["codec.batch"],
     "pipeline": ["ingest.batch", "ingest.hd", "pipeline.one_process", "pipeline.sustained", "pipeline.event_to_flow"],
+    "hop": ["hop.velod", "hop.zenoh"],
 }
 PEERS = {"flow.plane_fit": 1e-3, "depth.sparse_500": 0.5, "solve.window": 1e-3, "codec.batch": 0.0}
 """How far a case may be from its peer: relative speed, px, relative information, differing fields."""
@@ -36,12 +37,12 @@ def test_all_writes_every_name_with_times_and_ratios(tmp_path: Path, capsys: pyt
     out = tmp_path / "bench.json"
     assert bench("all", str(out), TINY) == 0
     rows = json.loads(out.read_text())
-    assert [r["name"] for r in rows] == [name for group in GROUPS for name in NAMES[group]]
+    assert [r["name"] for r in rows] == [name for group in (*GROUPS, "hop") for name in NAMES[group]]
     table = capsys.readouterr().out
     for r in rows:
         assert r["name"] in table
         assert r["median_us"] > 0.0 and r["n"] >= 1
-        if r["name"] in PEERS:
+        if r["name"] in (*PEERS, *NAMES["hop"]):
             assert r["peer"] and r["ratio"] == pytest.approx(r["peer_median_us"] / r["median_us"])
         else:
             assert (r["peer"], r["peer_median_us"], r["ratio"]) == (None, None, None)

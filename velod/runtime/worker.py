@@ -25,6 +25,9 @@ from velod.runtime.stages import Stage, create_stage, stage_of
 EXIT_USAGE = 2
 _PR_SET_PDEATHSIG = 1
 _SWITCH_INTERVAL_S = 0.0005
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
+_KEPT_BYTES = 32 << 20
+"""The largest that glibc takes for blocks that are not mapped one by one."""
 
 log = logging.getLogger("velod")
 
@@ -129,7 +132,18 @@ def prepare_process(parent: int) -> None:
         if os.getppid() != parent:
             raise OSError(f"the supervisor (process {parent}) is gone")
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
+    keep_memory()
     warmup.ensure_cache_directory()
+
+
+def keep_memory() -> None:
+    """Have the C library keep what is freed (glibc): it comes back as fast as it went.
+
+    Given back to the kernel, the memory of each large message would be mapped anew page by page: 0.3 ms for 405 KB.
+    """
+    if sys.platform == "linux" and hasattr(libc := ctypes.CDLL(None), "mallopt"):
+        libc.mallopt(_M_MMAP_THRESHOLD, _KEPT_BYTES)
+        libc.mallopt(_M_TRIM_THRESHOLD, 4 * _KEPT_BYTES)
 
 
 def stop_on_signals() -> Event:
