@@ -35,6 +35,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument("--texture", type=int, metavar="SEED", help="other leaves on walls and boxes")
     parser.add_argument("--threshold", type=float, metavar="C", help="contrast at which pixels fire (default 0.5)")
+    parser.add_argument(
+        "--vibration",
+        type=_vibration,
+        metavar="M/S,HZ",
+        help="of the whole rig, such as 1,8 (amplitude of the velocity)",
+    )
     group = parser.add_argument_group("real-sensor effects", "All off unless given.")
     group.add_argument(
         "--threshold-spread", type=float, metavar="C", help="mismatch of the thresholds (sigma; default 0.021)"
@@ -50,17 +56,20 @@ def recipe_of(args: argparse.Namespace) -> Sequence:
     """The sequence that the arguments ask for. Raises SequenceError, SensorError."""
     from velod.sim import sequence
     from velod.sim.effects import Effects
+    from velod.sim.trajectory import shaken
 
     recipe = sequence(args.sequence, args.texture)
     effects = Effects(radtan=args.distortion, **{field: getattr(args, field) for _, field, *_ in _EFFECTS})
-    events, imu = recipe.events, recipe.imu
+    events, imu, trajectory = recipe.events, recipe.imu, recipe.trajectory
+    if args.vibration is not None:
+        trajectory = shaken(trajectory, *args.vibration)
     if args.threshold is not None:
         events = replace(events, threshold=args.threshold)
     if args.threshold_spread is not None:
         events = replace(events, threshold_sigma=args.threshold_spread)
     if args.imu_hz is not None:
         imu = replace(imu, rate_hz=args.imu_hz)
-    return replace(recipe, effects=effects, events=events, imu=imu, sensor=args.sensor)
+    return replace(recipe, trajectory=trajectory, effects=effects, events=events, imu=imu, sensor=args.sensor)
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -68,6 +77,17 @@ def _size(text: str) -> tuple[int, int]:
     if match is None or not all(32 <= int(side) <= 4096 for side in match.groups()):
         raise argparse.ArgumentTypeError(f"must be WIDTHxHEIGHT, each from 32 to 4096, got {text!r}")
     return int(match[1]), int(match[2])
+
+
+def _vibration(text: str) -> tuple[float, float]:
+    amplitude_mps, _, hz = text.partition(",")
+    try:
+        values = float(amplitude_mps), float(hz)
+    except ValueError:
+        values = (0.0, 0.0)
+    if not all(0.0 < v < 1000.0 for v in values):
+        raise argparse.ArgumentTypeError(f"must be two positive numbers, M/S,HZ, got {text!r}")
+    return values
 
 
 def _coefficients(text: str) -> tuple[float, ...]:

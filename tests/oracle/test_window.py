@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 
-from tests.synthetic import CALIBRATION, FLIGHT, messages
+from tests.synthetic import CALIBRATION, FLIGHT, Motion, messages
 from velod.config import ImuSettings, Settings, from_tree
 from velod.geometry.so3 import exp, hat
 from velod.optimizer.estimator import Estimator, Head
@@ -159,6 +160,53 @@ def test_an_interval_adds_imu_and_flows_with_their_noise_marginalised_as_dense_a
     scale = np.abs(more).max()
     assert np.allclose(dense(w)[0] - H, more, atol=1e-9 * scale)
     assert np.allclose(dense(w)[1] - h, more_h, atol=1e-9 * scale)
+
+
+def test_scipy_reaches_the_same_minimum_of_the_same_cost():
+    """All rows one by one, the gyroscope's noise of every bin as an unknown: weights fixed, nothing compressed."""
+    rng = np.random.default_rng(12)
+    w = filled(4, rng)
+    H, h = dense(w)
+    root = np.linalg.cholesky(H)
+    interval, n = across_a_knot(w, rng), w.size
+    noise_sigma = ImuSettings().gyro_noise / (BIN_NS * 1e-9) ** 0.5
+    flows = []
+    for k in (0, 2, 3, 5):
+        J, y = rng.normal(size=(12, 9)) * 30.0, rng.normal(size=12)
+        interval.flows.L[k], interval.flows.eta[k] = J.T @ J, J.T @ y
+        flows.append((k, interval.flows.t_ns[k], J, y))
+
+    def residuals(z):
+        x, noise = z[:n], z[n:]
+        imu = interval.blocks[:, :12] @ (w.selector(interval.t_i) @ x)
+        imu += interval.blocks[:, 12:] @ (w.spline_row(interval.until) @ x) + interval.noise @ noise - interval.r
+        parts = [root.T @ x - np.linalg.solve(root, h), np.linalg.cholesky(interval.information).T @ imu]
+        for k, t, J, y in flows:
+            state = w.selector(t) @ x
+            turned = state[6:9] + noise[3 * k : 3 * k + 3]
+            parts.append(J @ np.concatenate([state[:3], turned, x[w.common_columns(t // KNOT_NS)]]) - y)
+        return np.concatenate([*parts, noise / noise_sigma])
+
+    zero = np.zeros(n + interval.noise.shape[1])
+    A = np.column_stack([residuals(unit) - residuals(zero) for unit in np.eye(len(zero))])
+    peer = least_squares(residuals, zero, jac=lambda _: A, x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    ours = w.solve([interval], None, 0.0)
+    sigma = np.sqrt(np.diag(np.linalg.inv(A.T @ A)))[:n]
+    assert np.abs((ours.x - peer.x[:n]) / sigma).max() < 1e-6
+
+
+def test_both_splines_tell_the_same_of_a_motion_that_both_can_represent():
+    """Without rotation and with a velocity that is smooth at the knots' distance, from sensors without noise."""
+    glide = Motion(np.zeros(3), np.array([2.0, 1.0, 0.3]), np.array([0.5, -0.4, 0.3]), np.array([1.0, 0.8, 1.2]))
+
+    def velocities(spline):
+        stage = OptimizerStage(from_tree({"optimizer": {"spline": spline}}), CALIBRATION)
+        stream = messages(glide, 1.2, noise=0.0, outliers=0.0)
+        return [v for m in stream for v in stage.handle(m) if isinstance(v, Velocity)]
+
+    pairs = [(a, b) for a, b in zip(velocities("error"), velocities("velocity"), strict=True) if a.valid and b.valid]
+    assert len(pairs) > 70
+    assert max(np.linalg.norm(a.v_B - b.v_B) for a, b in pairs) < 2e-3
 
 
 def test_the_window_keeps_its_size():

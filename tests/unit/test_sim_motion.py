@@ -17,6 +17,7 @@ from velod.sim.recipe import BASELINE_M
 from velod.sim.render import Renderer
 from velod.sim.sequences import mean_motion
 from velod.sim.texture import Texture, TextureRecipe, make_texture
+from velod.sim.trajectory import shaken
 from velod.sim.waves import Waves, integral, power, product
 
 NAMES = sorted(TABLE_I)
@@ -238,3 +239,16 @@ def test_the_integral_starts_where_it_is_told_and_has_its_sum_as_derivative() ->
     x, dx, _ = integral(SOME, start=2.5).at(t)
     assert x[0] == pytest.approx(2.5)
     assert np.allclose(dx, value(SOME, t), atol=1e-12)
+
+
+def test_a_vibration_adds_a_sine_to_the_velocity_and_its_derivatives_fit() -> None:
+    calm = sequence("spin-2").trajectory
+    shaking = shaken(calm, 1.0, 8.0)
+    t_s, h = np.linspace(0.0, 0.5, 2001), 1e-6
+    added = shaking.at(t_s).v_W - calm.at(t_s).v_W
+    assert np.isclose(np.linalg.norm(added, axis=1).max(), 1.0, atol=1e-4)
+    assert np.count_nonzero(np.diff(np.sign(added[1:-1, 0]))) == 7  # four periods in half a second
+    before, now, after = (shaking.at(t_s + dt) for dt in (-h, 0.0, h))
+    assert np.allclose((after.p_WB - before.p_WB) / (2 * h), now.v_W, atol=1e-6)
+    assert np.allclose((after.v_W - before.v_W) / (2 * h), now.a_W, atol=1e-5)
+    assert np.array_equal(now.R_WB, calm.at(t_s).R_WB)

@@ -82,6 +82,26 @@ class Trajectory:
         )
 
 
+@dataclass(frozen=True, slots=True)
+class Shaken(Trajectory):
+    """A trajectory that vibrates besides: a sine of the velocity, in all axes of W alike."""
+
+    amplitude_mps: float = 0.0
+    hz: float = 8.0
+
+    def at(self, t_s: F64) -> Motion:
+        """The state at ``t_s`` (n,)."""
+        calm, w = Trajectory.at(self, t_s), 2.0 * np.pi * self.hz
+        sine, cosine = (f(w * t_s)[:, None] * self.amplitude_mps / np.sqrt(3.0) for f in (np.sin, np.cos))
+        return Motion(calm.p_WB - cosine / w, calm.v_W + sine, calm.a_W + cosine * w, calm.R_WB, calm.omega_B)
+
+
+def shaken(trajectory: Trajectory, amplitude_mps: float, hz: float) -> Shaken:
+    """``trajectory`` with a vibration of ``amplitude_mps``."""
+    t = trajectory
+    return Shaken(t.position, t.yaw, t.pitch, t.roll, t.cylindrical, amplitude_mps, hz)
+
+
 def _attitude(yaw: tuple[F64, F64], pitch: tuple[F64, F64], roll: tuple[F64, F64]) -> tuple[F64, F64]:
     """R_WB (n, 3, 3) and omega_B (n, 3) from the angles and their rates."""
     (cy, cp, cr), (sy, sp, sr) = (tuple(f(angle[0]) for angle in (yaw, pitch, roll)) for f in (np.cos, np.sin))
