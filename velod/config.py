@@ -202,7 +202,7 @@ class OptimizerSettings:
     )
     fixed_sigma_px_s: float = _f(20.0, "sigma of a flow residual with weights = 'fixed', px/s", above=0.0, hi=1e4)
     shared_error: float = _f(
-        7.0, "information of a batch is divided by this for errors its flows share", lo=1.0, hi=100.0
+        6.0, "information of a batch is divided by this for errors its flows share", lo=1.0, hi=100.0
     )
     flow_scale_sigma: float = _f(
         0.004, "1 sigma of an error of all flows' speeds, as a share, which lasts seconds", above=0.0, hi=0.1

@@ -5,8 +5,10 @@ import numpy as np
 from velod.geometry.camera import motion_field_rows
 from velod.geometry.so3 import exp
 from velod.optimizer.flow_equation import (
+    BIN_NS,
     COMMON,
     Bins,
+    Fit,
     Measured,
     Rows,
     body_rows,
@@ -72,7 +74,7 @@ def test_compression_loses_nothing_of_velocity_bias_and_common_errors():
     rows = rows_of(np.array([2.0, -1.0, 1.0]), np.array([0.02, 0.01, -0.03]), rng)
     fit = solve(rows, 64, 1)
     c = rng.normal(size=(len(rows.z), 3)) * 50
-    bins = compress(rows, c, fit, shared_error=2.0)
+    bins = compress(rows, c, fit, shared_error=2.0, slope=np.zeros(3))
     J = np.hstack([rows.a, -rows.b, c]) * (np.sqrt(fit.weight / 2.0) / rows.sigma / fit.scale)[:, None]
     weighted_z = rows.z * np.sqrt(fit.weight / 2.0) / rows.sigma / fit.scale
     assert bins.count == 4
@@ -83,13 +85,28 @@ def test_compression_loses_nothing_of_velocity_bias_and_common_errors():
     assert np.isclose(bins.t_ns[0], (w @ rows.t_ns[first_bin]) / w.sum(), atol=1)
 
 
+def test_rows_are_taken_to_the_mean_time_of_their_bin_along_the_slope():
+    """e falls by 0.05 m/s within a bin: two batches of exact rows, compressed and added, still determine it."""
+    rng = np.random.default_rng(3)
+    e, slope, whole = np.array([1.0, -2.0, 0.5]), np.array([3.0, -9.0, 2.0]), Bins(0, 1)
+    for _ in range(2):
+        rows = rows_of(np.zeros(3), np.zeros(3), rng, m=30)
+        t_ns = rows.t_ns % BIN_NS
+        z = np.sum(rows.a * (e + slope * t_ns[:, None] * 1e-9), axis=1)
+        rows = Rows(t_ns, z, rows.a, rows.b, rows.sigma)
+        fit = Fit(e, np.eye(3), np.ones(30), 1.0, 1.0)
+        whole.add(compress(rows, np.zeros((30, 3)), fit, 1.0, slope), 1, slope)
+    found = np.linalg.solve(whole.L[0, :3, :3], whole.eta[0, :3])
+    assert np.allclose(found, e + slope * whole.t_ns[0] * 1e-9, atol=1e-7)
+
+
 def test_bins_add_to_those_of_the_same_number_and_to_no_others():
     whole, part = Bins(10, 6), Bins(8, 5)
     part.L[:], part.eta[:], part.total[:] = 1.0, 2.0, 3.0
-    whole.add(part, stop=12)
+    whole.add(part, 12, np.zeros(3))
     assert [whole.L[k, 0, 0] for k in range(6)] == [1.0, 1.0, 0.0, 0.0, 0.0, 0.0]
     assert whole.eta[1, 3] == 2.0 and whole.total[0, 1] == 3.0
-    whole.add(part, stop=9)
+    whole.add(part, 9, np.zeros(3))
     assert whole.L.sum() == 2 * 81
 
 

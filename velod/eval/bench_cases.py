@@ -262,7 +262,7 @@ def window(size: Size) -> Case:
         rows, fit = batches[-1]
         H, _ = dense_normal_equations(still.window, batches[-1:])
         compressed = np.zeros_like(H)
-        bins = compress(rows, np.zeros((len(rows.z), 3)), fit, 1.0)
+        bins = compress(rows, np.zeros((len(rows.z), 3)), fit, 1.0, np.zeros(3))
         for t_ns, L in zip(bins.t_ns, bins.L, strict=True):
             at = still.window.selector(t_ns)[_V_AND_BW]
             compressed += at.T @ L[:6, :6] @ at

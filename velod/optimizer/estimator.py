@@ -407,7 +407,7 @@ class Estimator:
             shared *= max(1.0, innovation / INNOVATION_GATE)
         if shared > self._o.shared_error:
             self._count("fit.inconsistent")
-        bins = flow_equation.compress(equations.on_spline, equations.common, fit, shared)
+        bins = flow_equation.compress(equations.on_spline, equations.common, fit, shared, self._slope())
         if len(weak_L):
             self._count("fit.degenerate")
             R_LB, _, _ = self._frame(t_ns)
@@ -420,14 +420,18 @@ class Estimator:
         self.first_usable_t_ns = t_ns if self.first_usable_t_ns < 0 else self.first_usable_t_ns
         self.last_usable_t_ns = max(self.last_usable_t_ns, t_ns)
 
+    def _slope(self) -> F64:
+        """Of the spline, m/s^2, as far as it is known: e falls as gravity says."""
+        return -self._gravity() if self._o.spline == "error" else np.zeros(3)
+
     def _share_out(self, bins: Bins) -> None:
         """Give each bin to the interval that it begins in, or to the window where that is closed."""
         upto = [interval.flows.first for interval in self._open[1:]]
         for interval, stop in zip(self._open, [*upto, bins.first + bins.count], strict=True):
-            interval.flows.add(bins, stop)
+            interval.flows.add(bins, stop, self._slope())
         for k in range(bins.first, min(self._open[0].flows.first, bins.first + bins.count)):
             alone = Interval(k * BIN_NS, (k + 1) * BIN_NS)
-            alone.flows.add(bins, k + 1)
+            alone.flows.add(bins, k + 1, self._slope())
             self.window.add_interval(alone)
 
     def _add_standstill(self, t_ns: int) -> None:

@@ -81,14 +81,15 @@ class Bins:
         """Mean time of what is in each bin; the start of an empty one."""
         return [(self.first + k) * BIN_NS + int(wt / max(w, 1e-300)) for k, (w, wt) in enumerate(self.total)]
 
-    def add(self, other: Bins, stop: int) -> None:
-        """Add the bins of ``other`` that are among these and below number ``stop``."""
+    def add(self, other: Bins, stop: int, slope: F64) -> None:
+        """Add the bins of ``other`` that are among these and below number ``stop``.
+
+        Each speaks of e at its mean time; ``slope`` (3,), m/s^2, of e takes both to that of the sum.
+        """
         start, stop = max(self.first, other.first), min(stop, self.first + self.count, other.first + other.count)
         if start < stop:
             own, its = (slice(start - bins.first, stop - bins.first) for bins in (self, other))
-            self.L[own] += other.L[its]
-            self.eta[own] += other.eta[its]
-            self.total[own] += other.total[its]
+            _merge(self.L[own], self.eta[own], self.total[own], other.L[its], other.eta[its], other.total[its], slope)
 
 
 def body_rows(
@@ -193,16 +194,17 @@ def turn_sensitivity(rows: Rows, fit: Fit) -> F64:
     return d_e_d_n
 
 
-def compress(rows: Rows, c: F64, fit: Fit, shared_error: float) -> Bins:
+def compress(rows: Rows, c: F64, fit: Fit, shared_error: float, slope: F64) -> Bins:
     """The rows, with those of ``common`` ``c`` (m, 3), as information in bins.
 
-    ``shared_error`` divides the information of the flows, for errors that they share within a batch.
+    ``shared_error`` divides the information of the flows, for errors that they share within a batch. ``slope`` (3,),
+    m/s^2, of e takes each row to the mean time of its bin.
     """
     first = int(rows.t_ns.min()) // BIN_NS
     bins = Bins(first, int(rows.t_ns.max()) // BIN_NS - first + 1)
     _compress(
         rows.t_ns, rows.z, rows.a, rows.b, c, rows.sigma, fit.weight, fit.scale**2 * shared_error,
-        first, bins.total, bins.L, bins.eta,
+        first, slope, bins.total, bins.L, bins.eta,
     )  # fmt: skip
     return bins
 
@@ -258,6 +260,7 @@ def _compress(
     weight: F64,
     variance: float,
     first: int,
+    slope: F64,
     total: F64,
     L: F64,
     eta: F64,
@@ -270,13 +273,40 @@ def _compress(
         at = t_ns[k] // BIN_NS - first
         total[at, 0] += w
         total[at, 1] += w * (t_ns[k] - (at + first) * BIN_NS)
+    for k in range(z.size):
+        if not weight[k] > 0.0:
+            continue
+        w = weight[k] / (sigma[k] * sigma[k] * variance)
+        at = t_ns[k] // BIN_NS - first
+        dt = (t_ns[k] - (at + first) * BIN_NS - total[at, 1] / total[at, 0]) * 1e-9
+        z_mean = z[k] - dt * (a[k, 0] * slope[0] + a[k, 1] * slope[1] + a[k, 2] * slope[2])
         for i in range(3):
             row[i], row[3 + i], row[6 + i] = a[k, i], -b[k, i], c[k, i]
         for i in range(9):
             wi = w * row[i]
-            eta[at, i] += wi * z[k]
+            eta[at, i] += wi * z_mean
             for j in range(9):
                 L[at, i, j] += wi * row[j]
+
+
+@njit(cache=True, nogil=True)
+def _merge(L, eta, total, more_L, more_eta, more_total, slope):  # type: ignore[no-untyped-def]
+    """Sum of both in the first three, each taken from its own mean time to that of the sum."""
+    for k in range(len(total)):
+        if not more_total[k, 0] > 0.0:
+            continue
+        w, more_w = total[k, 0], more_total[k, 0]
+        t = (total[k, 1] + more_total[k, 1]) / (w + more_w)
+        dt = (t - total[k, 1] / w) * 1e-9 if w > 0.0 else 0.0
+        more_dt = (t - more_total[k, 1] / more_w) * 1e-9
+        for i in range(9):
+            shift = more_shift = 0.0
+            for j in range(3):
+                shift += L[k, i, j] * slope[j]
+                more_shift += more_L[k, i, j] * slope[j]
+            eta[k, i] += shift * dt + more_eta[k, i] + more_shift * more_dt
+        L[k] += more_L[k]
+        total[k] += more_total[k]
 
 
 @njit(cache=True, nogil=True)
