@@ -138,8 +138,9 @@ def _soak(args: argparse.Namespace) -> int:
     )
     for p in result.processes:
         print(
-            f"{p.worker:<14} {p.seconds:6.0f} s  {p.mib:6.1f} MiB, {p.growth_mib:+.2f} in the last quarter,"
-            f" {p.slope_mib_h:+.2f} MiB/h; {p.files} files, {p.new_files:+d}",
+            f"{p.worker:<14} {p.seconds:6.0f} s  {p.mib:6.1f} MiB, {p.files} files; in the last third"
+            f" {p.growth_mib:+.2f} MiB ({p.slope_mib_h:+.2f} MiB/h), {p.new_files:+d} files;"
+            f" for each death {p.death_mib:+.2f} MiB, {p.death_files:+.1f} files",
             file=out,
         )
     if args.json is not None:
