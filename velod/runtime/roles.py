@@ -16,6 +16,7 @@ from velod.runtime.budget import LoadShedder
 from velod.runtime.dispatching import BatchDispatch
 from velod.runtime.inbox import Item
 from velod.runtime.measure import SensorClock
+from velod.runtime.sensor_clock import SensorClockFit
 from velod.runtime.shell import WorkerShell
 from velod.runtime.stages import Limited, Reckoning, Stage
 from velod.runtime.succession import Succession, Turn
@@ -50,6 +51,7 @@ class IngestShell(WorkerShell):
         self, session: zenoh.Session, settings: Settings, stage_name: str, worker: str, stage: Stage
     ) -> None:
         super().__init__(session, settings, stage_name, worker, stage)
+        self._sensor_clock = SensorClockFit()
         self._dispatch = BatchDispatch(self.outlet, settings.zenoh.lossless)
         # A lossless replay waits for the slowest instead.
         self._load = LoadShedder(0.0 if settings.zenoh.lossless else 1e-3 * settings.ingest.budget_ms)
@@ -89,6 +91,7 @@ class IngestShell(WorkerShell):
     def publish(self, outputs: Sequence[Message], cause: Envelope) -> None:
         """Batches originate here and now: their results carry this time to the velocity."""
         t_origin_ns = time.time_ns()
+        self._sensor_clock.heard(cause.message.t_ns, t_origin_ns)
         for output in outputs:
             if isinstance(output, EventBatch | StereoBatch):
                 self._dispatch.send(output, t_origin_ns)
@@ -116,8 +119,8 @@ class IngestShell(WorkerShell):
         return {**super().alarms(), **self._dispatch.alarms(), **self._load.alarms()}
 
     def gauges(self) -> dict[str, float]:
-        """With the shares of the load that were taken on."""
-        return {**super().gauges(), **self._load.shares()}
+        """With the shares of the load that were taken on, and the sensor's clock."""
+        return {**super().gauges(), **self._load.shares(), **self._sensor_clock.gauges()}
 
 
 class BatchShell(WorkerShell):
