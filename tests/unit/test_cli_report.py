@@ -152,6 +152,8 @@ def metrics(ave_mps: float, valid_fraction: float) -> Metrics:
         n=100,
         ave_mps=ave_mps,
         rve_percent=1.0,
+        rve_quartiles_percent=(0.5, 0.9, 1.2),
+        rve_p95_percent=2.0,
         median_mps=0.01,
         p95_mps=0.1,
         max_mps=0.2,

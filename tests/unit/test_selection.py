@@ -72,6 +72,16 @@ def test_what_the_quota_leaves_room_for_are_events_with_a_narrow_neighbourhood_p
     assert set(y) == {12, 13, 14}  # the columns passed in these 4 ms: rows 13 = middle of 7
 
 
+def test_edges_too_slow_for_a_wide_neighbourhood_are_selected_by_their_narrow_one_at_once() -> None:
+    # 80 px/s: two columns in 25 ms, three in 37.5 ms, of which half the memory leaves 50 ms less the batch's 20.
+    first, t_end = one_edge(150.1, speed=80.0)  # the edge is at column 12
+    taken = new_surface(HEIGHT, WIDTH)
+    x, _, _ = burst(first, t_end - 20 * MS, t_end, taken, quota=500)
+    assert set(x) == {9, 10}
+    x, _, _ = burst(one_edge(170.1, speed=80.0)[0], t_end, t_end + 20 * MS, taken, quota=500)
+    assert set(x) == {11}
+
+
 def test_an_event_is_selected_once() -> None:
     first, t_end = one_edge(60.1)
     taken = new_surface(HEIGHT, WIDTH)

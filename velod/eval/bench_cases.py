@@ -6,7 +6,7 @@ import math
 import pickle
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import fields
+from dataclasses import fields, replace
 from itertools import count
 from typing import Any
 
@@ -108,8 +108,9 @@ def sae(size: Size) -> Case:
 
 
 def plane_fit(batch: EventBatch) -> Case:
-    """``flow.plane_fit``: the flow of one selected event, against numpy's least squares on each patch."""
+    """``flow.plane_fit``: the flow of one event from its 5x5, against numpy's least squares on each patch."""
     stage, n = FlowStage(Settings(), RIG), len(batch.x)
+    batch = replace(batch, ring=batch.ring[:0])
     offset = np.arange(SIZE)
     A = np.column_stack([offset % 5 - 2.0, offset // 5 - 2.0, np.ones(SIZE)])
 

@@ -56,8 +56,9 @@ def select_burst(
     leaves ``min_neighbours`` of the inner 25 after rejection (see ``fit_plane``) with an rms below ``max_rms_px``. It
     is at most half the memory old, so it may be older than the batch.
 
-    What the quota leaves room for are events with a 5x5 alone, completed in the time before that is as long as the
-    batch: edges too short or too curved for a 7x7.
+    What the quota leaves room for are events with a 5x5 alone: completed in the time before that is as long as the
+    batch where edges are too short or too curved for a 7x7, at once where they are too slow for one to fit into the
+    memory.
 
     ``encoded`` is ``encode_ages(first, t_end_ns, memory_ns)``. ``taken`` (2, h, w) holds the stamps selected before:
     those are skipped, and the new ones are entered.
@@ -66,12 +67,13 @@ def select_burst(
     """
     unit_ns = age_unit_ns(memory_ns)
     span = -((t_start_ns - t_end_ns) // unit_ns)
+    oldest = memory_ns // 2 // unit_ns
     chosen = np.empty(0, np.int32)
     for reach_px, since, until in ((REACH, span, 0), (HALF, 2 * span, span)):
         room = quota - len(chosen)
         if room > 0:
             mask = np.zeros(first.shape, np.uint8)
-            _mark_passed(encoded, reach_px, memory_ns // 2 // unit_ns, since, until, mask)
+            _mark_passed(encoded, reach_px, oldest, since, until, oldest - span, mask)
             more = _choose(
                 first, mask, t_end_ns, memory_ns, border_px, room, seq,
                 True, reject_px, rejections, min_neighbours, max_rms_px, taken,
@@ -152,11 +154,12 @@ def _choose(
 
 
 @njit(cache=True, nogil=True)
-def _mark_passed(age: U16, reach_px: int, oldest: int, since: int, until: int, mask: U8) -> None:
+def _mark_passed(age: U16, reach_px: int, oldest: int, since: int, until: int, slow: int, mask: U8) -> None:
     """Mark pixels whose eight neighbours ``reach_px`` away lie symmetrically about them in time, as on a plane.
 
     A filter that vectorises, and spares most of the fits. The pixel's ``age`` must be below ``oldest``, that of its
-    newest outer neighbour below ``since`` and at least ``until``; all in encoded steps, of which 0 counts as oldest.
+    newest outer neighbour below ``since`` and at least ``until``, or any where the edge takes more than ``slow`` from
+    the middle to ``REACH``; all in encoded steps, of which 0 counts as oldest.
     """
     _, h, w = age.shape
     n = w - 2 * reach_px
@@ -179,7 +182,8 @@ def _mark_passed(age: U16, reach_px: int, oldest: int, since: int, until: int, m
                 plane = np.float32(symmetric) <= np.float32(MAX_ASYMMETRY) * np.float32(antisymmetric)
                 newest = min(min(min(a, b), min(c, d)), min(min(e, f), min(g, j)))
                 passed = newest + t
-                marks[i] = np.uint8(plane & (t < oldest) & (passed < since) & (passed >= until))
+                waited = (passed >= until) | (REACH * (t - passed) > slow * reach_px)
+                marks[i] = np.uint8(plane & (t < oldest) & (passed < since) & waited)
 
 
 @njit(cache=True, nogil=True, inline="always")
