@@ -144,7 +144,7 @@ class FlowSettings:
 @dataclass(frozen=True, slots=True)
 class DepthSettings:
     workers: int = _f(1, "processes", lo=1, hi=64)
-    tau_ms: float = _f(20.0, "decay of the time surfaces of block matching, ms", above=0.0, hi=1000.0)
+    tau_ms: float = _f(10.0, "decay of the time surfaces of block matching, ms", above=0.0, hi=1000.0)
     block_px: int = _f(17, "side of the matching block, odd", lo=5, hi=41)
     max_disparity_px: int = _f(
         0,
