@@ -51,6 +51,12 @@ def test_matches_equal_the_numpy_twins(seed: int) -> None:
         np.testing.assert_allclose(out.score[i], score, atol=1e-4)
         np.testing.assert_allclose(out.second[i], second, atol=1e-4)
         assert out.enclosed[i] == enclosed
+        scores = twin(left, right, int(x[i]), int(y[i]))
+        if second > -1.0:
+            np.testing.assert_allclose(scores[int(out.rival[i])], second, atol=1e-4)
+            assert abs(out.rival[i] - int(np.argmax(scores))) > 2
+        else:
+            assert np.isnan(out.rival[i])
 
 
 def test_matching_back_finds_the_same_disparity() -> None:

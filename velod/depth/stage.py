@@ -18,6 +18,9 @@ from velod.types import F32, F64, I64, DepthBatch, StereoBatch
 
 Bools = NDArray[np.bool_]
 
+# Where the second peak of the correlation reaches this share of the first, refinement decides whether it is a rival.
+_RIVAL_SHARE = 0.75
+_RIVAL_PX = 2.0
 # Block matching along an edge that lies in the row: twice the spread of other edges, and an error that neighbours
 # share, so that it must not average out.
 _FLAT_EDGE_FACTOR = 4.0
@@ -57,6 +60,7 @@ class DepthStage:
         is_refined = refined.outcome == REFINED
         disparity = np.where(is_refined, refined.disparity, matches.disparity)
         accepted = self._accept(left, right_mirrored, x, y, matches, disparity, refined.outcome)
+        accepted &= ~self._has_rival(message, matches, disparity, accepted & is_refined)
         return [self._publish(message, disparity, self._sigma_px(refined), is_refined, accepted)]
 
     def _fits(self, message: StereoBatch) -> bool:
@@ -141,6 +145,27 @@ class DepthStage:
         self.counters["points.low_zncc"] += int(np.count_nonzero(matched & trusted & ~strong))
         self.counters["points.ambiguous"] += int(np.count_nonzero(strong & ~accepted))
         return accepted
+
+    def _has_rival(self, message: StereoBatch, matches: Matches, disparity: F64, among: Bools) -> Bools:
+        """(n,) refined points whose second match is nearly as good, and confirmed by plane coincidence as well.
+
+        A repetitive texture matches itself a period away in both directions: left and right agree on the wrong one.
+        """
+        at = np.flatnonzero(among & (matches.second >= _RIVAL_SHARE * matches.score))
+        second = refine(
+            message.left,
+            message.right,
+            message.unit_ns,
+            message.x[at],
+            message.y[at],
+            message.p[at],
+            matches.rival[at],
+            self._rectification,
+        )
+        out = np.zeros_like(among)
+        out[at] = (second.outcome == REFINED) & (np.abs(second.disparity - disparity[at]) > _RIVAL_PX)
+        self.counters["points.ambiguous"] += int(np.count_nonzero(out))
+        return out
 
     def _left_right_agree(
         self, left: Surface, right_mirrored: Surface, x: I64, y: I64, disparity: F64, candidates: Bools

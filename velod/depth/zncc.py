@@ -44,6 +44,7 @@ class Matches:
     disparity: F32  # (n,) px, sub-pixel
     score: F32  # (n,) ZNCC of the best whole disparity, -1..1
     second: F32  # (n,) ZNCC of the best one more than 2 px away, -1: none
+    rival: F32  # (n,) its whole disparity, px, NaN: none
     enclosed: NDArray[np.bool_]  # (n,) the best has a neighbour on both sides: a real peak
 
 
@@ -56,9 +57,8 @@ def match(
     and mirror: the mirrored right surface is the reference, its x is w - 1 - x, and the left one is as it is.
     """
     n = x.shape[0]
-    out = Matches(
-        np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, dtype=np.bool_)
-    )
+    disparity, score, second, rival = (np.empty(n, np.float32) for _ in range(4))
+    out = Matches(disparity, score, second, rival, np.empty(n, dtype=np.bool_))
     half = block_px // 2
     _match(
         reference.values,
@@ -76,6 +76,7 @@ def match(
         out.disparity,
         out.score,
         out.second,
+        out.rival,
         out.enclosed,
     )
     return out
@@ -182,6 +183,7 @@ def _match(
     disparity: F32,
     score: F32,
     second: F32,
+    rival: F32,
     enclosed: NDArray[np.bool_],
 ) -> None:
     h, w = reference.shape
@@ -191,6 +193,7 @@ def _match(
         disparity[k] = np.nan
         score[k] = np.nan
         second[k] = -1.0
+        rival[k] = np.nan
         enclosed[k] = False
         # The block must lie inside at x and at x - d.
         if xk < half or xk >= w - half or yk < half or yk >= h - half:
@@ -208,6 +211,9 @@ def _match(
         while scores[best] < score[k]:
             best += 1
         second[k] = max(_largest(scores[: max(best - 2, 0)]), _largest(scores[min(best + 3, n) : n]))
+        for d in range(n):
+            if scores[d] == second[k] and abs(d - best) > 2:
+                rival[k] = d
         offset = np.float32(0.0)
         if 0 < best < n - 1:
             enclosed[k] = True
