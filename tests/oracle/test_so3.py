@@ -40,11 +40,17 @@ def test_quaternions_are_xyzw_as_scipys(w: np.ndarray) -> None:
     q = so3.quaternion_from_matrix(R.as_matrix())
     np.testing.assert_allclose(q, R.as_quat(canonical=True), atol=1e-12)
     np.testing.assert_allclose(so3.matrix_from_quaternion(3.0 * q), R.as_matrix(), atol=1e-12)
+    out = np.empty(4)
+    so3.quaternion_so3(R.as_matrix(), out)
+    np.testing.assert_allclose(out, q, atol=1e-14)
 
 
 def test_a_half_turn_about_each_axis_has_a_quaternion() -> None:
     for R in (np.diag([1.0, -1.0, -1.0]), np.diag([-1.0, 1.0, -1.0]), np.diag([-1.0, -1.0, 1.0])):
         np.testing.assert_allclose(so3.matrix_from_quaternion(so3.quaternion_from_matrix(R)), R, atol=1e-15)
+        out = np.empty(4)
+        so3.quaternion_so3(R, out)
+        np.testing.assert_allclose(so3.matrix_from_quaternion(out), R, atol=1e-15)
 
 
 @pytest.mark.parametrize("length", LENGTHS)

@@ -4,7 +4,7 @@ import numpy as np
 
 from tests.synthetic import CALIBRATION, FLIGHT, messages
 from velod.config import from_tree
-from velod.geometry.so3 import exp, matrix_from_quaternion
+from velod.geometry.so3 import exp, hat, matrix_from_quaternion, quaternion_from_matrix
 from velod.optimizer.dead_reckoning import DeadReckoning, upright
 from velod.optimizer.stage import OptimizerStage
 from velod.types import Odometry, Velocity
@@ -20,6 +20,46 @@ def reckon_flight(reckoning, seconds=2.0, hz=200):
     way_W = ((v_W[1:] + v_W[:-1]) / 2 / hz).sum(axis=0)
     R_OW = upright(np.eye(3), FLIGHT.R_WB(0.0).T @ [0.0, 0.0, 9.81]) @ FLIGHT.R_WB(0.0).T
     return out, R_OW @ way_W, R_OW
+
+
+def plain_step(dt, R_OB, p, P, v_O, v_B, cov, turn, g_B, tilt_cov, tau, gyro_noise):
+    """One step of the reckoning in plain matrices."""
+    z = np.array([0.0, 0.0, 1.0])
+    R = R_OB @ turn
+    up = R @ g_B / np.linalg.norm(g_B)
+    axis = np.cross(up, z)
+    sine = np.linalg.norm(axis)
+    R = exp(axis / sine * np.arctan2(sine, up[2])) @ R
+    mean = 0.5 * (v_O + R @ v_B)
+    F = np.eye(4)
+    F[:3, 3] = np.cross(z, mean) * dt
+    P = F @ P @ F.T
+    turned = hat(mean) @ hat(z) @ R
+    P[:3, :3] += (R @ cov @ R.T + turned @ tilt_cov @ turned.T) * (2.0 * tau * dt)
+    P[3, 3] += gyro_noise**2 * dt
+    return R, p + mean * dt, P, np.linalg.norm(mean) * dt
+
+
+def test_a_step_is_what_plain_matrices_say():
+    rng = np.random.default_rng(4)
+    for _ in range(50):
+        A = rng.normal(size=(2, 3, 3))
+        cov, tilt_cov = 1e-3 * A @ A.transpose(0, 2, 1)
+        v, g = rng.normal(size=(3, 3)), rng.normal(size=(3, 3))
+        R_LB = exp(rng.normal(size=(3, 3)) * 2.0)
+        reckoning = DeadReckoning(0.7, 0.3)
+        reckoning.update(0, v[0], cov, R_LB[0], g[0], tilt_cov)
+        # the second of two steps begins with all of a covariance
+        for k, t_ns in ((1, 5_000_000), (2, 12_000_000)):
+            dt = (t_ns - reckoning._t_ns) * 1e-9
+            before = (reckoning._R_OB.copy(), reckoning._p_O.copy(), reckoning._cov.copy(), reckoning._v_O.copy())
+            way, turn = reckoning._distance_m, R_LB[k - 1].T @ R_LB[k]
+            out = reckoning.update(t_ns, v[k], cov, R_LB[k], g[k], tilt_cov)
+            R, p, P, step = plain_step(dt, *before, v[k], cov, turn, g[k], tilt_cov, 0.7, 0.3)
+            assert np.allclose(reckoning._cov, P, rtol=1e-12, atol=1e-14)
+            assert np.allclose(out.p_OB, p, rtol=1e-12, atol=1e-14)
+            assert np.allclose(out.q_OB, quaternion_from_matrix(R), rtol=0, atol=1e-12)
+            assert abs(out.distance_m - way - step) < 1e-14
 
 
 def test_an_exact_velocity_is_integrated_to_the_true_way_and_attitude():

@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+from scipy import linalg
 
 from tests.synthetic import CALIBRATION, Motion, errors, messages
 from velod.config import from_tree
-from velod.optimizer.degeneracy import complement, information, weak_directions, without
+from velod.optimizer.degeneracy import TRUSTED, complement, information, weak_directions, without
 from velod.optimizer.stage import OptimizerStage
 from velod.types import Velocity
 
@@ -68,6 +69,23 @@ def test_scatter_of_the_normals_is_no_information():
     # a tenth of the edges across the others is enough
     a[::10], across[::10] = across[::10], -a[::10]
     assert weak_directions(*information(a, across, np.full(400, 0.03), weight)).shape == (0, 3)
+
+
+def test_weak_directions_are_the_generalised_eigenvectors_below_the_limit():
+    rng = np.random.default_rng(5)
+    counts = set()
+    for _ in range(200):
+        A, B = rng.normal(size=(2, 3, 3))
+        scatter = A @ A.T + 0.1 * np.eye(3)
+        said = B @ np.diag(rng.uniform(0.0, 60.0, 3)) @ B.T
+        ratio, vectors = linalg.eigh(said, scatter)
+        weak = weak_directions(said, scatter)
+        assert len(weak) == np.count_nonzero(ratio < TRUSTED)
+        # the same space
+        span = vectors[:, : len(weak)]
+        assert np.allclose(weak.T @ (weak @ span), span, atol=1e-3)
+        counts.add(len(weak))
+    assert counts >= {0, 1, 2}
 
 
 def test_what_is_taken_out_is_what_an_unknown_offset_takes_out():

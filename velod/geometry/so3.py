@@ -127,3 +127,27 @@ def exp_so3(w: F64, out: F64) -> None:
     out[2, 0] = b * x * z - a * y
     out[2, 1] = b * y * z + a * x
     out[2, 2] = 1.0 - b * (x * x + y * y)
+
+
+@njit(cache=True, nogil=True)
+def quaternion_so3(R: F64, q: F64) -> None:
+    """``quaternion_from_matrix`` for kernels: the unit quaternion, xyzw, w >= 0, of R (3, 3) into q (4,)."""
+    best, largest = 0, -1.0
+    for i in range(4):
+        # 4 times the square of component i
+        t = 1.0 + R[0, 0] + R[1, 1] + R[2, 2] if i == 3 else 1.0 + 2.0 * R[i, i] - R[0, 0] - R[1, 1] - R[2, 2]
+        if t > largest:
+            best, largest = i, t
+    q[best] = largest
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        real = R[k, j] - R[j, k]
+        if best == 3:
+            q[i] = real
+        elif best == i:
+            q[j], q[k], q[3] = R[j, i] + R[i, j], R[k, i] + R[i, k], real
+    scale = 1.0 / math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    if q[3] < 0.0:
+        scale = -scale
+    for i in range(4):
+        q[i] *= scale

@@ -8,6 +8,7 @@ of the row across it. What a direction has of information is therefore compared 
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 
 from velod.optimizer.flow_equation import Fit, Measured, Rows
 from velod.types import F64
@@ -48,9 +49,11 @@ def information(a: F64, across: F64, direction_sigma: F64, weight: F64) -> tuple
 
 def weak_directions(said: F64, scatter: F64) -> F64:
     """Unit vectors (k, 3) of the directions in which ``said`` is no more than ``scatter`` explains; orthonormal."""
-    floor = SINGULAR * float(np.trace(said)) / 3.0
+    floor = SINGULAR * float(said[0, 0] + said[1, 1] + said[2, 2]) / 3.0
     if floor <= 0.0:
         return np.eye(3)
+    if _exceeds(said, scatter, TRUSTED, floor):
+        return np.empty((0, 3))
     # generalised eigenvalues of (said, scatter): whiten by scatter
     root = np.linalg.cholesky(scatter + floor * np.eye(3))
     half = np.linalg.solve(root, said)
@@ -59,8 +62,26 @@ def weak_directions(said: F64, scatter: F64) -> F64:
     return np.ascontiguousarray(np.linalg.qr(weak)[0].T)
 
 
+@njit(cache=True, nogil=True)
+def _exceeds(said: F64, scatter: F64, factor: float, floor: float) -> bool:
+    """Whether said - factor (scatter + floor I), (3, 3), is positive definite: no direction is weak."""
+    a = said[0, 0] - factor * (scatter[0, 0] + floor)
+    d = said[1, 1] - factor * (scatter[1, 1] + floor)
+    f = said[2, 2] - factor * (scatter[2, 2] + floor)
+    b, c, e = (
+        said[0, 1] - factor * scatter[0, 1],
+        said[0, 2] - factor * scatter[0, 2],
+        said[1, 2] - factor * scatter[1, 2],
+    )
+    minor = a * d - b * b
+    det = a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)
+    return bool(a > 0.0 and minor > 0.0 and det > 0.0)
+
+
 def complement(directions: F64) -> F64:
     """Orthonormal rows (3 - k, 3) across orthonormal ``directions`` (k, 3)."""
+    if not len(directions):
+        return np.eye(3)
     return np.asarray(np.linalg.svd(np.vstack([directions, np.zeros((1, 3))]))[2][len(directions) :])
 
 

@@ -119,6 +119,17 @@ class InertialMemory:
 
 
 @njit(cache=True, nogil=True)
+def continues(t_ns: I64, after_ns: int, gap_ns: int) -> bool:
+    """Whether samples go on after ``after_ns`` without a step back or beyond ``gap_ns``; False for none."""
+    before = after_ns
+    for t in t_ns:
+        if t <= before or t - before > gap_ns:
+            return False
+        before = t
+    return len(t_ns) > 0
+
+
+@njit(cache=True, nogil=True)
 def _nominal_step(a0, a1, w0, w1, b, dt, R, s, phi, E, M):  # type: ignore[no-untyped-def]
     """R <- R Exp(int w), s <- s + int R (a - b_a), samples linear from 0 to 1; Simpson over two half steps."""
     for i in range(3):

@@ -7,6 +7,7 @@ from numba import njit
 
 from velod.geometry.so3 import hat
 from velod.optimizer.preintegration import Preintegration
+from velod.optimizer.small import add_sandwich, multiply
 from velod.types import F64
 
 IMU_MODEL_SIGMA = 1e-3
@@ -46,36 +47,12 @@ def linearise(
 
 
 @njit(cache=True, nogil=True)
-def _multiply(a: F64, b: F64, out: F64) -> None:
-    """out = a b."""
-    for i in range(a.shape[0]):
-        for j in range(b.shape[1]):
-            s = 0.0
-            for k in range(b.shape[0]):
-                s += a[i, k] * b[k, j]
-            out[i, j] = s
-
-
-@njit(cache=True, nogil=True)
 def _multiply_hat(a: F64, v: F64, out: F64) -> None:
     """out = a [v]x."""
     for i in range(3):
         out[i, 0] = a[i, 1] * v[2] - a[i, 2] * v[1]
         out[i, 1] = a[i, 2] * v[0] - a[i, 0] * v[2]
         out[i, 2] = a[i, 0] * v[1] - a[i, 1] * v[0]
-
-
-@njit(cache=True, nogil=True)
-def _add_sandwich(J: F64, P: F64, out: F64) -> None:
-    """out += J P J^T, for J (3, n)."""
-    n = J.shape[1]
-    for i in range(3):
-        for k in range(n):
-            s = 0.0
-            for m in range(n):
-                s += J[i, m] * P[m, k]
-            for j in range(3):
-                out[i, j] += s * J[j, k]
 
 
 @njit(cache=True, nogil=True)
@@ -110,18 +87,18 @@ def _carry(
             v[i] += R_T[i, k] * (beta[k] + v_i[k] - g_B * dt)
     _multiply_hat(np.eye(3), v, hat_v)
     J[:, :3] = R_T
-    _multiply(R_T, d_beta_d_ba, block)
+    multiply(R_T, d_beta_d_ba, block)
     J[:, 3:6] = block
-    _multiply(R_T, d_beta_d_bw, block)
+    multiply(R_T, d_beta_d_bw, block)
     J[:, 6:9] = block
-    _multiply(hat_v, d_theta_d_bw, block)
+    multiply(hat_v, d_theta_d_bw, block)
     J[:, 6:9] += block
-    _multiply(R_LB, R_gamma, block)
+    multiply(R_LB, R_gamma, block)
     J[:, 9:] = -dt * block.T
     N[:, :3], N[:, 3:] = hat_v, R_T
     out[:, :] = 0.0
-    _add_sandwich(J, cov, out)
-    _add_sandwich(N, cov_imu, out)
+    add_sandwich(J, cov, out)
+    add_sandwich(N, cov_imu, out)
 
 
 @njit(cache=True, nogil=True)
@@ -150,10 +127,10 @@ def _linearise(
     # Eq. 14: beta(b) - R(gamma(b)) v_j - g_B dt + v_i = 0
     blocks[:, :3] = M_i
     blocks[:, 3:6] = d_beta_d_ba
-    _multiply(turned, d_theta_d_bw, block)
+    multiply(turned, d_theta_d_bw, block)
     blocks[:, 6:9] = d_beta_d_bw + block
     blocks[:, 9:12] = -dt * R_LBi.T
-    _multiply(R_gamma, M_j, block)
+    multiply(R_gamma, M_j, block)
     blocks[:, 12:] = -block
     for i in range(3):
         r[i] = -beta[i] - N_i[i]
@@ -163,7 +140,7 @@ def _linearise(
         G[i, :3] = turned[i]
         G[i, 3 + i] = 1.0
         cov[i, i] = IMU_MODEL_SIGMA**2
-    _add_sandwich(G, cov_imu, cov)
+    add_sandwich(G, cov_imu, cov)
     _invert(cov, information)
 
 

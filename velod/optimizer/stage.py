@@ -20,6 +20,7 @@ from velod.optimizer.calibration_check import CalibrationCheck
 from velod.optimizer.dead_reckoning import DeadReckoning
 from velod.optimizer.estimator import Estimator
 from velod.optimizer.frame import output_frame
+from velod.optimizer.inertial import continues
 from velod.optimizer.parts import Parts, batch_seq
 from velod.types import F64, NS_PER_S, DepthBatch, FlowBatch, ImuSamples, Odometry, TrackingState, Velocity
 
@@ -133,6 +134,15 @@ class OptimizerStage:
         self._closed_seq = -1
 
     def _append_samples(self, m: ImuSamples) -> None:
+        t_ns = m.sample_t_ns
+        if self._imu_t_ns >= 0 and self._tick >= 0 and continues(t_ns, self._imu_t_ns, IMU_GAP_NS):
+            self._estimator.add_imu(m)
+            self._imu_t_ns = int(t_ns[-1])
+        elif len(t_ns):
+            self._append_uneven(m)
+
+    def _append_uneven(self, m: ImuSamples) -> None:
+        """Samples that begin anew, go back or have holes."""
         new = m.sample_t_ns > self._imu_t_ns
         if not new.all():
             self._count("imu.backwards", int((~new).sum()))
