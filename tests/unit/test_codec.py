@@ -233,3 +233,9 @@ def test_a_full_batch_of_raw_events_is_nine_bytes_an_event() -> None:
     n = 45_000
     packet = events(list(range(T, T + n)))
     assert 9 * n < len(encode(packet, 1)) < 9 * n + 256
+
+
+@pytest.mark.parametrize("n", [0, 1, 255, 256, 65_535, 65_536])
+def test_the_bytes_are_those_that_msgpack_itself_makes_of_the_map(n: int) -> None:
+    data = encode(events([T] * n, x=np.zeros(n, np.uint16), y=np.zeros(n, np.uint16)), 1)
+    assert msgpack.packb(msgpack.unpackb(data)) == data

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import operator
+import struct
 from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass
@@ -23,12 +24,18 @@ from velod.wire.schema import MESSAGE_TYPES, VERSION, Field, Schema, WireError, 
 MAX_BYTES = 64 << 20
 """Largest message. A 1280x720 StereoBatch has 11 MB, a second of 5 Mev/s has 45 MB."""
 
-_OTHER_BYTES = 4096
-"""Room for what is not in a column; the buffer of a message that needs more grows."""
+_PACKER_BYTES = 4096
+"""Room for one thing that is no column; the packer's buffer grows where it needs more."""
 _MAX_STR = 1 << 16
 _MAX_MAP = 1024
 _INT64 = (-(2**63), 2**63 - 1)
 _U32 = np.dtype("<u4")
+_BIN_HEADERS = (
+    (1 << 8, struct.Struct(">BB"), 0xC4),
+    (1 << 16, struct.Struct(">BH"), 0xC5),
+    (1 << 32, struct.Struct(">BI"), 0xC6),
+)
+"""msgpack's bin 8, 16 and 32: below which length, layout, first byte."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,12 +60,27 @@ def encode(message: Message, t_pub_ns: int, t_origin_ns: int = 0) -> bytes:
             raise WireError("wire.too_large", f"{name}: {dim.name} = {sizes[dim.name]}, the limit is {dim.max}")
         if dim.sent:
             tree[dim.name] = sizes[dim.name]
-    # A buffer that holds it all at once is not copied while it grows.
-    columns = sum(value.nbytes for value in tree.values() if isinstance(value, memoryview))
-    data: bytes = msgpack.Packer(buf_size=columns + _OTHER_BYTES).pack(tree)
+    data = _pack(tree)
     if len(data) > MAX_BYTES:
         raise WireError("wire.too_large", f"{name}: {len(data)} bytes, the limit is {MAX_BYTES}")
     return data
+
+
+def _pack(tree: dict[str, Any]) -> bytes:
+    """The bytes that ``msgpack.packb`` would make, with each column copied once: into its place."""
+    packer = msgpack.Packer(buf_size=_PACKER_BYTES)
+    pieces: list[bytes | memoryview] = [packer.pack_map_header(len(tree))]
+    for name, value in tree.items():
+        pieces.append(packer.pack(name))
+        pieces += (_bin_header(value.nbytes), value) if isinstance(value, memoryview) else (packer.pack(value),)
+    return b"".join(pieces)
+
+
+def _bin_header(n_bytes: int) -> bytes:
+    for limit, layout, first in _BIN_HEADERS:
+        if n_bytes < limit:
+            return layout.pack(first, n_bytes)
+    raise WireError("wire.too_large", f"a column of {n_bytes} bytes, the limit is {MAX_BYTES}")
 
 
 def decode(data: bytes | bytearray | memoryview, expect: type[Any] | None = None) -> Envelope:
