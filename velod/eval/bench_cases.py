@@ -28,6 +28,7 @@ from velod.ingest.stage import IngestStage
 from velod.optimizer.estimator import Estimator
 from velod.optimizer.flow_equation import Fit, Rows, body_rows, compress, on_velocity, solve
 from velod.optimizer.interval import BLOCK
+from velod.optimizer.stage import OptimizerStage
 from velod.optimizer.window import Window
 from velod.types import (
     F64,
@@ -38,6 +39,7 @@ from velod.types import (
     FlowBatch,
     ImuPacket,
     Message,
+    Odometry,
     StereoBatch,
     Velocity,
 )
@@ -307,17 +309,19 @@ def _basis(u: F64) -> F64:
 
 
 def imu_rate(size: Size) -> Case:
-    """``output.imu_rate``: the velocity at the newest IMU sample, carried there by the IMU, with its covariance."""
-    estimator = Estimator(Settings(), RIG)
-    for imu, flow, depth in bench_input.estimates(size.window, size.flows, seed=3):
-        estimator.add_imu(imu)
-        estimator.absorb(flow, depth)
-    newest_ns = int(estimator.memory.t_ns[-1])
-    earlier = count()
+    """``output.imu_rate``: all that a velocity between two batches costs the stage, as bytes.
 
-    def run() -> tuple[F64, F64] | None:
-        # Another moment each time, as the estimator remembers what it has predicted.
-        return estimator.predict(newest_ns - next(earlier) % 4_000_000)
+    It is carried there by the IMU, with covariance, attitude, judgement and dead reckoning.
+    """
+    stage = OptimizerStage(Settings(), RIG)
+    stream = list(bench_input.estimates(size.window, size.flows, seed=3))
+    out = [answer for batch in stream for message in batch for answer in stage.handle(message)]
+    assert isinstance(out[-1], Odometry), "the made-up input ends with a valid velocity"
+    # Another moment each time, as the estimator remembers what it has predicted.
+    later_ns = count(stream[-1][1].t_ns + 5_000_000, 1_000)
+
+    def run() -> list[bytes]:
+        return [encode(answer, 1) for answer in stage.put_out(next(later_ns))]
 
     return Case("output.imu_rate", run)
 

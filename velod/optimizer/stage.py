@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
@@ -191,7 +192,7 @@ class OptimizerStage:
                 self._take_out_of_order(tau)
             else:
                 self._take_in_silence(tau)
-            out += self._put_out(tau)
+            out += self.put_out(tau)
             self._tick += 1
         return out
 
@@ -273,8 +274,8 @@ class OptimizerStage:
         if (own := self._estimator.own_solution) is not None and own[0] == flow.t_ns:
             self._check.add_solution(*own)
 
-    def _put_out(self, tau: int) -> list[Velocity | Odometry]:
-        """The velocity at ``tau``; with its dead reckoning where it is valid."""
+    def put_out(self, tau: int) -> list[Velocity | Odometry]:
+        """The velocity at ``tau`` from what has been taken in; with its dead reckoning where it is valid."""
         attitude = self._estimator.attitude(tau)
         if attitude is not None and not self._frame.is_imu:
             attitude = attitude.seen_from(self._frame.R_FB)
@@ -297,16 +298,16 @@ class OptimizerStage:
             v, cov = self._frame.velocity(v, cov, rate)
             weak_B = weak_B @ self._frame.R_FB.T
         state, reason, valid = self._judge(tau, v, cov, weak_B)
-        velocity = Velocity(
-            self._seq, tau, v, cov, valid, state, reason, *self._newest,
-            age_ms=(self._now_ns - tau) * 1e-6, frame=self._frame.name,
-        )  # fmt: skip
+        known: dict[str, Any] = {}
         if len(weak_B):
-            velocity = replace(
-                velocity, degenerate=len(weak_B), degenerate_B=np.vstack([weak_B, np.zeros((3, 3))])[:3]
-            )
+            known["degenerate_B"] = np.vstack([weak_B, np.zeros((3, 3))])[:3]
+        if attitude is not None:
+            known["up_B"], known["up_cov"] = attitude.up_B, attitude.up_cov
         self._seq += 1
-        return velocity if attitude is None else replace(velocity, up_B=attitude.up_B, up_cov=attitude.up_cov)
+        return Velocity(
+            self._seq - 1, tau, v, cov, valid, state, reason, *self._newest,
+            age_ms=(self._now_ns - tau) * 1e-6, frame=self._frame.name, degenerate=len(weak_B), **known,
+        )  # fmt: skip
 
     def _judge(self, tau: int, v: F64, cov: F64, weak_B: F64) -> tuple[str, str, bool]:
         """State, reason and validity of an estimate."""
