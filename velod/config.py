@@ -113,7 +113,7 @@ class IngestSettings:
         hi=10_000.0,
     )
     budget_ms: float = _f(
-        50.0,
+        100.0,
         "beside a sensor: while a batch or a packet waits for longer than this, less is taken on, ms; 0: never",
         lo=0.0,
         hi=10_000.0,
@@ -203,6 +203,10 @@ class OptimizerSettings:
     fixed_sigma_px_s: float = _f(20.0, "sigma of a flow residual with weights = 'fixed', px/s", above=0.0, hi=1e4)
     shared_error: float = _f(
         6.0, "information of a batch is divided by this for errors its flows share", lo=1.0, hi=100.0
+    )
+    shared_gyro_noise: bool = _f(
+        True,
+        "the gyroscope's noise of a moment is in its flows as well, or false: in the IMU's factor alone (the paper)",
     )
     flow_scale_sigma: float = _f(
         0.004, "1 sigma of an error of all flows' speeds, as a share, which lasts seconds", above=0.0, hi=0.1

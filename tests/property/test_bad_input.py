@@ -95,7 +95,7 @@ def test_a_calibration_with_alien_values_is_refused_by_name(
 ) -> None:
     tree = slanted_scene.RIG.to_tree()
     inner = tree[data.draw(st.sampled_from(sorted(tree)))]
-    target = inner if isinstance(inner, dict) and data.draw(st.booleans()) else tree
+    target = inner if isinstance(inner, dict) and inner and data.draw(st.booleans()) else tree
     target[data.draw(st.sampled_from(sorted(target)))] = data.draw(YAML)
     path = tmp_path_factory.getbasetemp() / "alien.yaml"
     path.write_text(yaml.safe_dump(tree), "utf-8")

@@ -188,7 +188,9 @@ def test_a_worker_that_hangs_is_passed_over_and_loses_no_batch(slanted: Path, se
     assert wake.done
     assert lost(seqs) == 0
     assert longest_gap_s(result) <= 0.1
-    assert result.health["ingest-0"].counters["dispatch.resent.flow"] >= 1
+    # whether its time was up first, or its lease
+    counters = result.health["ingest-0"].counters
+    assert counters.get("dispatch.expired.flow", 0) + counters.get("dispatch.resent.flow", 0) >= 1
 
 
 CONSUMER = """

@@ -14,7 +14,7 @@ import pytest
 
 from tests import slanted_scene
 from tests.system.hosts import Network, why_not
-from tests.system.rig import Rig, Stalls, pid_of
+from tests.system.rig import Rig, Stalls
 from velod.config import OptimizerSettings, Settings
 
 pytestmark = [pytest.mark.system, pytest.mark.skipif(bool(why_not()), reason=why_not())]
@@ -32,11 +32,11 @@ def rig(tmp_path: Path) -> Iterator[Rig]:
         yield rig
 
 
-def leader(rig: Rig) -> str:
-    """By the health of both, of which one leads and one stands by; asked while velocities flow."""
-    roles = {w: h["role"] for w, h in rig.seen_so_far().newest_health().items() if h["stage"] == "optimizer"}
-    assert sorted(roles.values()) == ["leads", "standby"]
-    return next(worker for worker, role in roles.items() if role == "leads")
+def leader(rig: Rig) -> int:
+    """Its process, by the health of both, of which one leads and one stands by; asked while velocities flow."""
+    pids = {h["role"]: h["pid"] for h in rig.seen_so_far().newest_health().values() if h["stage"] == "optimizer"}
+    assert sorted(pids) == ["leads", "standby"]
+    return int(pids["leads"])
 
 
 def test_whatever_happens_to_the_leader_consumers_see_one_stream(rig: Rig) -> None:
@@ -56,9 +56,9 @@ def test_whatever_happens_to_the_leader_consumers_see_one_stream(rig: Rig) -> No
 def kill_one_and_stop_the_other(rig: Rig) -> None:
     player = rig.start_player("compute")
     rig.wait_for_velocities(150)
-    os.kill(pid_of(leader(rig), rig.compute), signal.SIGKILL)
+    os.kill(leader(rig), signal.SIGKILL)
     rig.wait_for_velocities(350)
-    os.kill(pid := pid_of(leader(rig), rig.compute), signal.SIGSTOP)
+    os.kill(pid := leader(rig), signal.SIGSTOP)
     time.sleep(1.2)
     os.kill(pid, signal.SIGCONT)
     rig.wait_for_velocities(570)

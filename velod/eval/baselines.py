@@ -18,6 +18,8 @@ from velod.optimizer.inertial import InertialMemory
 from velod.types import F64, I64, NS_PER_S, ImuSamples, TrackingState, Velocity
 
 NO_COVARIANCE = np.full((3, 3), np.nan)
+NO_COMMON_ERROR = 1e-6
+"""Sigma of a state that shall stay 0."""
 
 
 def integrate_imu(imu: Imu, truth: Truth, settings: Settings) -> list[Velocity]:
@@ -86,7 +88,8 @@ def paper_settings(settings: Settings) -> Settings:
              asks; no gate on the residual, of which the paper says nothing (velod's own gates would take most of
              these events: 62 % on boxes-4)
     depth    block matching alone (Sec. III-C), 17 x 17, 48 px (Sec. V-A): no plane coincidence, every match kept
-    weights  one fixed P_c, "set empirically" (below Eq. 14): 20 px/s, and a fifth of the information
+    weights  one fixed P_c, "set empirically" (below Eq. 14): 20 px/s, and a fifth of the information; no common
+             errors of flows, and the gyroscope's noise in the inertial term alone (Eq. 9, 14)
     spline   of the velocity itself (Eq. 7), knots of 0.1 s, preintegration over 0.03 s (Sec. V-A)
 
     The SAE reaches ``memory_ms`` back whatever a batch's length; the paper sets it no limit.
@@ -108,6 +111,10 @@ def paper_settings(settings: Settings) -> Settings:
             weights="fixed",
             fixed_sigma_px_s=20.0,
             shared_error=5.0,
+            shared_gyro_noise=False,
+            flow_scale_sigma=NO_COMMON_ERROR,
+            depth_scale_sigma=NO_COMMON_ERROR,
+            delay_sigma_ms=NO_COMMON_ERROR,
         ),
     )
 

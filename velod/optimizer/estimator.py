@@ -106,8 +106,9 @@ class Estimator:
         o = self._o
         common_sigma = np.array([o.flow_scale_sigma, o.delay_sigma_ms * 1e-3, o.depth_scale_sigma])
         self.window = Window(
-            self._imu, self._knot_ns, self._segments, SMOOTHNESS[o.spline], common_sigma, self._bias_margin
-        )
+            self._imu, self._knot_ns, self._segments, SMOOTHNESS[o.spline], common_sigma, self._bias_margin,
+            o.shared_gyro_noise,
+        )  # fmt: skip
         self.head: Head | None = None
         self.batches = 0  # that gave a velocity
         self.first_usable_t_ns = -1
@@ -372,7 +373,8 @@ class Estimator:
     def _linearise(self, interval: Interval, t_j: int) -> None:
         """Eq. 14's inertial residual over [t_i, ``t_j``], in the frame B_i, its gyroscope noise by bins."""
         t_i, interval.until = interval.t_i, t_j
-        p = self._preintegrate(t_i, t_j, *self._biases(), gyro_noise=0.0)
+        shared = self._o.shared_gyro_noise
+        p = self._preintegrate(t_i, t_j, *self._biases(), gyro_noise=0.0 if shared else None)
         R_LBi, N_i, M_i = self._frame(t_i)
         _, N_j, M_j = self._frame(t_j)
         head = self.head
@@ -381,7 +383,7 @@ class Estimator:
         interval.blocks, interval.r, interval.information = inertial_residual.linearise(
             p, R_LBi, (N_i, M_i), (N_j, M_j), v_j
         )
-        if head is not None:
+        if head is not None and shared:
             edges = interval.bin_edges()
             middles = (edges[:-1] + edges[1:]) // 2
             R_LB, s_L, _ = self.memory.at(middles)
@@ -403,7 +405,8 @@ class Estimator:
         shared = self._o.shared_error
         if predicted is not None:
             innovation = self._innovation(t_ns, equations.on_error, fit, predicted, weak_L)
-            self.consistency.note(innovation)
+            if self._o.weights == "propagated":  # a sigma that is fixed says nothing of what noise explains
+                self.consistency.note(innovation)
             shared *= max(1.0, innovation / INNOVATION_GATE)
         if shared > self._o.shared_error:
             self._count("fit.inconsistent")

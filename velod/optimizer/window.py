@@ -26,6 +26,8 @@ UNKNOWN_VELOCITY = 100.0
 """Prior sigma of the first control points, m/s: no knowledge."""
 ACCELERATION = 3.0
 """Sigma of the acceleration at the start, m/s^2, where the specific force's norm does not speak of more."""
+NO_NOISE = 1e15
+"""Information of a gyroscope's noise that is none, (rad/s)^-2."""
 NORM_SIGMA = 0.02
 """Of |g| = gravity, m/s^2: local gravity differs from the setting."""
 
@@ -62,15 +64,17 @@ class Window:
         smoothness: float,
         common_sigma: F64,
         bias_margin: float = 1.0,
+        shared_gyro_noise: bool = True,
     ) -> None:
         """``smoothness``: sigma of the second difference of control points, m/s; weak, so that none is free.
 
-        ``common_sigma`` (3,): of the common errors of the flows; ``bias_margin`` is on the biases' sigmas at start.
+        ``common_sigma`` (3,): of the common errors of the flows; ``bias_margin`` is on the biases' sigmas at start;
+        ``shared_gyro_noise``: whether intervals leave the gyroscope's noise to be found by the flows as well.
         """
         self._bias_margin = bias_margin
         self._common_sigma = common_sigma
         self._imu = imu
-        self._noise_information = BIN_NS * 1e-9 / imu.gyro_noise**2
+        self._noise_information = BIN_NS * 1e-9 / imu.gyro_noise**2 if shared_gyro_noise else NO_NOISE
         self._knot_ns = knot_ns
         self._segments = segments
         self._smoothness = smoothness

@@ -15,6 +15,8 @@ from velod.ingest.budget import BAND_ROWS, LEAST_ROWS, Budget
 
 FALL = 0.8
 """A share is multiplied by this while something is late, once in the time that is late."""
+GRACE_S = 0.25
+"""It falls only after so long without a moment in time: a process that starts beside velod is no overload."""
 RISE_PER_S = 0.5
 """A share grows by so much in a second while nothing is."""
 CALM = 0.5
@@ -42,14 +44,16 @@ class Share:
     least: float
     value: float = 1.0
     _last_s: float = math.inf
+    _late_s: float = math.inf  # since when there has been delay
     _patience_s: float = -math.inf  # no further fall before: the last one has not had its effect
 
     def note(self, delay_s: float, now_s: float) -> None:
         """What is waiting now has waited for ``delay_s``."""
         elapsed_s = max(0.0, now_s - self._last_s)
         self._last_s = now_s
+        self._late_s = min(self._late_s, now_s) if delay_s > self.target_s else math.inf
         if delay_s > self.target_s:
-            if now_s >= self._patience_s:
+            if now_s >= max(self._patience_s, self._late_s + GRACE_S):
                 self.value = max(self.least, self.value * FALL)
                 self._patience_s = now_s + self.target_s
         elif delay_s < CALM * self.target_s:
