@@ -23,7 +23,11 @@ HOLE_S = 5.0
 
 
 def test_what_befalls_one_consumer_is_no_other_s_concern(tmp_path: Path) -> None:
-    """One behind 1 % loss, 5 ms and 100 Mbit; two in a black hole for 5 s; one that stops for 10 s; one untouched."""
+    """One behind 1 % loss, 5 ms and 100 Mbit; two in a black hole for 5 s; one that stops for 10 s; one untouched.
+
+    The bounds are about twice what was measured on two cores (numbers and aims: docs/distribution.md). They catch
+    what is broken, not a slow moment.
+    """
     names = ("poor", "holed", "stopped", "bystander")
     recording = slanted_scene.write(tmp_path / "slanted.h5", 14.0)
     with Network("compute", *names) as network, Stalls() as stalls:
@@ -46,12 +50,12 @@ def test_what_befalls_one_consumer_is_no_other_s_concern(tmp_path: Path) -> None
         seen = {name: rig.seen(process, name) for name, process in processes.items()}
     busy_s = 2.0 * stalls.longest_s
     untouched = seen["bystander"]
-    assert untouched.longest_gap_s() <= 0.1 + busy_s
+    assert untouched.longest_gap_s() <= 0.25 + busy_s
     assert untouched.lost_on_the_way() == seen["poor"].lost_on_the_way() == 0
-    assert np.percentile(seen["poor"].travel_ms(), 99) <= 60.0 + 1e3 * busy_s
+    assert np.percentile(seen["poor"].travel_ms(), 99) <= 150.0 + 1e3 * busy_s
     # TCP tries to connect once a second: to the introducer, which tells of the consumer, and then from the optimizer.
-    assert Cost.of(seen["holed"], (began_ns, healed_ns)).back_s <= 2.0 + busy_s
-    assert Cost.of(seen["stopped"], (began_ns, awake_ns)).back_s <= 1.0 + busy_s
+    assert Cost.of(seen["holed"], (began_ns, healed_ns)).back_s <= 4.0 + busy_s
+    assert Cost.of(seen["stopped"], (began_ns, awake_ns)).back_s <= 2.0 + busy_s
     for name in names:
         assert_fresh(seen[name], busy_s)
 
