@@ -22,6 +22,7 @@ pytestmark = [pytest.mark.system, pytest.mark.skipif(bool(why_not()), reason=why
 HOLE_S = 5.0
 
 
+@pytest.mark.long  # and, since a bystander sometimes misses seconds, known to fail: docs/distribution.md
 def test_what_befalls_one_consumer_is_no_other_s_concern(tmp_path: Path) -> None:
     """One behind 1 % loss, 5 ms and 100 Mbit; two in a black hole for 5 s; one that stops for 10 s; one untouched.
 
