@@ -126,28 +126,26 @@ def _kill_consumer(rig: Rig) -> Span:
 
 def unplug(host: str, seconds: float = 5.0) -> Fault:
     """The cable of one host is pulled out, and put back."""
-
-    def harm(rig: Rig) -> Span:
-        rig.network[host].plug(connected=False)
-        began_ns = _now()
-        time.sleep(seconds)
-        rig.network[host].plug(connected=True)
-        return began_ns, _now()
-
-    return Fault(f"link of the {host} down, {seconds:g} s", harm)
+    return Fault(
+        f"link of the {host} down, {seconds:g} s",
+        lambda rig: _for_a_while(lambda on: rig.network[host].plug(connected=not on), seconds),
+    )
 
 
 def swallow(host: str, seconds: float = 5.0) -> Fault:
     """All that one host sends and is sent is swallowed, without a word."""
+    return Fault(
+        f"black hole around the {host}, {seconds:g} s",
+        lambda rig: _for_a_while(lambda on: rig.network[host].black_hole(swallows=on), seconds),
+    )
 
-    def harm(rig: Rig) -> Span:
-        rig.network[host].black_hole(swallows=True)
-        began_ns = _now()
-        time.sleep(seconds)
-        rig.network[host].black_hole(swallows=False)
-        return began_ns, _now()
 
-    return Fault(f"black hole around the {host}, {seconds:g} s", harm)
+def _for_a_while(harm: Callable[[bool], None], seconds: float) -> Span:
+    harm(True)
+    began_ns = _now()
+    time.sleep(seconds)
+    harm(False)
+    return began_ns, _now()
 
 
 def _poor(rig: Rig) -> None:
