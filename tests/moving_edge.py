@@ -51,6 +51,11 @@ def batch(
     y, x = np.nonzero(usable(rect, left))
     chosen = rng.choice(len(x), min(points, len(x)), replace=False)
     y, x = y[chosen], x[chosen]
+    return stereo_batch(left, right, x, y)
+
+
+def stereo_batch(left: np.ndarray, right: np.ndarray, x: np.ndarray, y: np.ndarray) -> StereoBatch:
+    """The ON events at (x, y) of the left surface, with both surfaces (h, w) uint16."""
     return StereoBatch(
         seq=3,
         t_ns=T_NS,

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-from tests.moving_edge import PLAIN_RIG, UNIT_NS, Edge, batch, surface
+from tests.moving_edge import PLAIN_RIG, Edge, batch, stereo_batch, surface
 from velod.config import Settings
 from velod.depth import stage as module
 from velod.depth.stage import DepthStage
@@ -69,17 +67,7 @@ def half_occluded() -> tuple[StereoBatch, np.ndarray, np.ndarray]:
     hidden_first = np.argsort(~((x >= 96) & (x < 110)), kind="stable")
     some = np.concatenate([rng.permutation(hidden_first[:1500])[:200], rng.permutation(hidden_first[1500:])[:400]])
     y, x = y[some], x[some]
-    message = replace(
-        batch(Edge()),
-        x=x.astype(np.uint16),
-        y=y.astype(np.uint16),
-        age=left[y, x].astype(np.uint32) * np.uint32(UNIT_NS),
-        p=np.ones(len(x), np.uint8),
-        left=np.stack([np.zeros_like(left), left]),
-        right=np.stack([np.zeros_like(right), right]),
-        left_last=left,
-        right_last=right,
-    )
+    message = stereo_batch(left, right, x, y)
     return message, np.where((x >= 110) & (x < 160), 20.0, 6.0), (x >= 96) & (x < 110)
 
 
