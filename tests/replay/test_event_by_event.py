@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
+
+from velod.cli import main
 from velod.cli_stages import true_depth_of
 from velod.config import from_tree
 from velod.eval.front_end import FrontEnd
@@ -35,3 +39,20 @@ def test_flow_and_velocity_hold_without_batches_to_wait_for(simulated: Callable[
     metrics = evaluate(velocities, recording.truth, recording.t_start_ns)
     assert metrics.ave_mps < 0.12
     assert metrics.valid_fraction == 1.0
+
+
+def test_the_stages_are_judged_by_command_in_this_mode_too(
+    simulated: Callable[[str, float], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = tmp_path / "event.toml"
+    config.write_text('[ingest]\nmode = "event"\n')
+    found = {}
+    for mode, chosen in (("event", ["-c", str(config)]), ("batch", [])):
+        out = tmp_path / f"{mode}.json"
+        recording = str(simulated("corridor-1", 0.6))
+        assert main(["eval", recording, *chosen, "--stages", "--json", str(out)]) == 0
+        assert "Normal flow against the truth" in capsys.readouterr().out
+        found[mode] = json.loads(out.read_text())
+    # The same events' truth; a causal neighbourhood holds the past half only, and so scatters more.
+    assert found["batch"]["flow"]["spread"] < found["event"]["flow"]["spread"] < 0.06
+    assert abs(found["event"]["flow"]["bias"]) < 0.01
