@@ -5,14 +5,16 @@ from __future__ import annotations
 from dataclasses import fields
 from typing import Any
 
+import msgpack
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from velod.types import Message
+from velod.types import EventPacket, Message
 from velod.wire import WireError, decode, encode
 from velod.wire.schema import MESSAGE_TYPES, Field, Schema, schema
+from velod.wire.unpack import unpack_views
 
 I64 = st.integers(-(2**62), 2**62)
 TEXT = st.text("aZ0.-é", max_size=12)
@@ -104,3 +106,23 @@ def test_a_mutated_message_is_decoded_or_refused(message: Message, data: st.Data
     if decoded_or_refused(bytes(mutated)):
         again = decode(bytes(mutated)).message
         assert type(again) in MESSAGE_TYPES.values()
+
+
+@settings(max_examples=300)
+@given(messages(), st.data())
+def test_views_are_what_msgpack_reads_or_nothing(message: Message, data: st.DataObject) -> None:
+    mutated = bytearray(encode(message, 1))
+    for _ in range(data.draw(st.integers(0, 2))):
+        mutated[data.draw(st.integers(0, len(mutated) - 1))] = data.draw(st.integers(0, 255))
+    views = unpack_views(mutated)
+    if views is not None:
+        copied = {name: bytes(v) if isinstance(v, memoryview) else v for name, v in views.items()}
+        # Compared as bytes, because a number may have become NaN.
+        assert msgpack.packb(copied) == msgpack.packb(msgpack.unpackb(mutated))
+
+
+def test_a_message_of_columns_and_plain_values_is_read_as_views() -> None:
+    packet = EventPacket(0, 5, "left", *(np.zeros(70_000, t) for t in (np.uint16, np.uint16, np.int64, np.uint8)))
+    views = unpack_views(encode(packet, 1))
+    assert views is not None
+    assert isinstance(views["x"], memoryview) and views["x"].nbytes == 140_000

@@ -12,6 +12,7 @@ import struct
 from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import msgpack
@@ -19,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from velod.types import Message
-from velod.wire.schema import MESSAGE_TYPES, VERSION, Field, Schema, WireError, schema
+from velod.wire.schema import MESSAGE_TYPES, OFFSET, VERSION, Field, Schema, WireError, schema
+from velod.wire.unpack import unpack_views
 
 MAX_BYTES = 64 << 20
 """Largest message. A 1280x720 StereoBatch has 11 MB, a second of 5 Mev/s has 45 MB."""
@@ -29,7 +31,10 @@ _PACKER_BYTES = 4096
 _MAX_STR = 1 << 16
 _MAX_MAP = 1024
 _INT64 = (-(2**63), 2**63 - 1)
-_U32 = np.dtype("<u4")
+_TIMES = np.dtype("<i8")
+_BIN_TYPES = (bytes, memoryview)
+_WORTH_VIEWS = 16_384
+"""Bytes; shorter messages are read faster by msgpack."""
 _BIN_HEADERS = (
     (1 << 8, struct.Struct(">BB"), 0xC4),
     (1 << 16, struct.Struct(">BH"), 0xC5),
@@ -48,32 +53,60 @@ class Envelope:
 
 
 def encode(message: Message, t_pub_ns: int, t_origin_ns: int = 0) -> bytes:
-    """The bytes of a message. Raises WireError where it does not fit its schema (dtype, shape, span)."""
+    """The bytes of a message, as ``msgpack.packb`` would make them, with each column copied once: into its place.
+
+    Raises WireError where it does not fit its schema (dtype, shape, span).
+    """
     name = type(message).__name__
     s = schema(name)
-    tree: dict[str, Any] = {"schema": s.name, "v": VERSION, "t_pub_ns": t_pub_ns, "t_origin_ns": t_origin_ns}
-    sizes: dict[str, int] = {}
+    out = _Writer(s, message.t_ns)
+    out.put("t_pub_ns", t_pub_ns)
+    out.put("t_origin_ns", t_origin_ns)
     for f in s.fields:
-        _WRITE[f.kind](s, f, getattr(message, f.name), tree, sizes)
+        _WRITE[f.kind](f, getattr(message, f.name), out)
     for dim in s.dims.values():
-        if sizes[dim.name] > dim.max:
-            raise WireError("wire.too_large", f"{name}: {dim.name} = {sizes[dim.name]}, the limit is {dim.max}")
+        if out.sizes[dim.name] > dim.max:
+            raise WireError("wire.too_large", f"{name}: {dim.name} = {out.sizes[dim.name]}, the limit is {dim.max}")
         if dim.sent:
-            tree[dim.name] = sizes[dim.name]
-    data = _pack(tree)
+            out.put(dim.name, out.sizes[dim.name])
+    data = b"".join(out.pieces)
     if len(data) > MAX_BYTES:
         raise WireError("wire.too_large", f"{name}: {len(data)} bytes, the limit is {MAX_BYTES}")
     return data
 
 
-def _pack(tree: dict[str, Any]) -> bytes:
-    """The bytes that ``msgpack.packb`` would make, with each column copied once: into its place."""
-    packer = msgpack.Packer(buf_size=_PACKER_BYTES)
-    pieces: list[bytes | memoryview] = [packer.pack_map_header(len(tree))]
-    for name, value in tree.items():
-        pieces.append(packer.pack(name))
-        pieces += (_bin_header(value.nbytes), value) if isinstance(value, memoryview) else (packer.pack(value),)
-    return b"".join(pieces)
+class _Writer:
+    """The pieces of one message, and the sizes of its columns so far."""
+
+    __slots__ = ("_names", "_pack", "pieces", "s", "sizes", "t_ns")
+
+    def __init__(self, s: Schema, t_ns: int) -> None:
+        self.s, self.t_ns = s, t_ns
+        self.sizes: dict[str, int] = {}
+        self._pack = msgpack.Packer(buf_size=_PACKER_BYTES).pack
+        head, self._names = _packed_names(s.name)
+        self.pieces: list[bytes | memoryview] = [head]
+
+    def put(self, name: str, value: Any) -> None:
+        """A value that is no column."""
+        self.pieces += (self._names[name], self._pack(value))
+
+    def put_column(self, name: str, column: memoryview) -> None:
+        self.pieces += (self._names[name], _bin_header(column.nbytes), column)
+
+
+@cache
+def _packed_names(full: str) -> tuple[bytes, dict[str, bytes]]:
+    """How a message of a schema begins, and the names of what follows."""
+    s = schema(full.removeprefix("velod."))
+    names = ["t_pub_ns", "t_origin_ns", *(f.base for f in s.fields if f.base), *(f.sent_as for f in s.fields)]
+    names += [dim.name for dim in s.dims.values() if dim.sent]
+    packer = msgpack.Packer()
+    first = {"schema": s.name, "v": VERSION}
+    head = packer.pack_map_header(len(first) + len(names))
+    for name, value in first.items():
+        head += packer.pack(name) + packer.pack(value)
+    return head, {name: packer.pack(name) for name in names}
 
 
 def _bin_header(n_bytes: int) -> bytes:
@@ -94,18 +127,25 @@ def decode(data: bytes | bytearray | memoryview, expect: type[Any] | None = None
     values = {f.name: _value(s, f, tree, sizes) for f in s.fields}
     for f in s.fields:
         if f.kind == "column":
-            _check_column(s, f, values)
+            if f.promises:
+                _check_column(s, f, values)
         elif f.not_after and values[f.name] > values[f.not_after]:
             raise WireError("wire.time_backwards", f"{s.name}: {f.name} is after {f.not_after}")
-    head = schema("Envelope")
-    times = {f.name: _value(s, f, tree, sizes) for f in head.fields if f.name.startswith("t_")}
+    times = {f.name: _value(s, f, tree, sizes) for f in _host_times()}
     message = MESSAGE_TYPES[s.name.removeprefix("velod.")](**values)
     return Envelope(message=message, **times)
+
+
+@cache
+def _host_times() -> tuple[Field, ...]:
+    return tuple(f for f in schema("Envelope").fields if f.name.startswith("t_"))
 
 
 def _unpack(data: bytes | bytearray | memoryview) -> dict[str, Any]:
     if len(data) > MAX_BYTES:
         raise WireError("wire.too_large", f"{len(data)} bytes, the limit is {MAX_BYTES}")
+    if len(data) > _WORTH_VIEWS and (views := unpack_views(data)) is not None:
+        return views
     try:
         tree = msgpack.unpackb(
             data, max_str_len=_MAX_STR, max_map_len=_MAX_MAP, max_bin_len=len(data), max_array_len=0, max_ext_len=0
@@ -142,38 +182,24 @@ def _short(value: Any) -> str:
 
 def _sizes(s: Schema, tree: dict[str, Any]) -> dict[str, int]:
     """Every dim of a received message: scalars that were sent, and the rows of the longest column."""
-    sizes: dict[str, int] = {}
-    for dim in s.dims.values():
-        sizes[dim.name] = _sent_size(s, dim.name, tree) if dim.sent else 0
+    sizes = {
+        d.name: _read_int(s, _int_field(d.name, 0, _INT64[1]), tree, {}) if d.sent else 0 for d in s.dims.values()
+    }
     for f in s.fields:
-        if f.shape and isinstance(f.shape[0], str) and not s.dims[f.shape[0]].sent and _sent(f, tree):
-            row = _row_bytes(f)
-            sizes[f.shape[0]] = max(sizes[f.shape[0]], -(-len(_bin(s, f, tree)) // row))
+        if f.counts_rows and _sent(f, tree):
+            rows = -(-len(_bin(s, f, tree)) // f.row_bytes)
+            sizes[f.counts_rows] = max(sizes[f.counts_rows], rows)
     for dim in s.dims.values():
         if sizes[dim.name] > dim.max:
             raise WireError("wire.too_large", f"{s.name}: {dim.name} = {sizes[dim.name]}, the limit is {dim.max}")
     return sizes
 
 
-def _sent_size(s: Schema, name: str, tree: dict[str, Any]) -> int:
-    return _read_int(s, Field(name, "int", min=0), tree, {})
-
-
-def _row_bytes(f: Field) -> int:
-    dtype = f.dtype or _U32
-    count = 1
-    for part in f.shape[1:]:
-        if isinstance(part, int):
-            count *= part
-    return dtype.itemsize * count
-
-
-def _bin(s: Schema, f: Field, tree: dict[str, Any]) -> bytes:
-    name = f.offsets or f.name
-    data = _get(s, name, tree)
-    if type(data) is not bytes:
-        raise WireError("wire.field_type", f"{s.name}: {name} must be bin, got {type(data).__name__}")
-    return data
+def _bin(s: Schema, f: Field, tree: dict[str, Any]) -> bytes | memoryview:
+    data = _get(s, f.sent_as, tree)
+    if type(data) not in _BIN_TYPES:
+        raise WireError("wire.field_type", f"{s.name}: {f.sent_as} must be bin, got {type(data).__name__}")
+    return data  # type: ignore[no-any-return]
 
 
 def _get(s: Schema, name: str, tree: dict[str, Any]) -> Any:
@@ -255,16 +281,25 @@ def _read_column(s: Schema, f: Field, tree: dict[str, Any], sizes: dict[str, int
 
 
 def _read_times(s: Schema, f: Field, tree: dict[str, Any], sizes: dict[str, int]) -> NDArray[np.int64]:
-    base = _read_int(s, Field(f.base, "int", min=_INT64[0], max=_INT64[1] - 2**32), tree, sizes)
+    # So that none of the times leaves the range.
+    base = _read_int(s, _int_field(f.base, _INT64[0], _INT64[1] - 2**32), tree, sizes)
     data = _bin(s, f, tree)
-    _check_length(s, f, len(data), sizes[str(f.shape[0])] * _U32.itemsize)
-    return np.frombuffer(data, _U32) + np.int64(base)
+    _check_length(s, f, len(data), sizes[f.counts_rows] * f.row_bytes)
+    times = np.frombuffer(data, OFFSET).astype(np.int64)
+    times += base
+    return times
+
+
+@cache
+def _int_field(name: str, lo: int, hi: int) -> Field:
+    """A number that is sent for a column's sake."""
+    return Field(name, "int", min=lo, max=hi)
 
 
 def _check_length(s: Schema, f: Field, got: int, want: int) -> None:
     if got != want:
         reason = "wire.column_short" if got < want else "wire.column_long"
-        raise WireError(reason, f"{s.name}: {f.offsets or f.name} has {got} bytes, {want} belong there")
+        raise WireError(reason, f"{s.name}: {f.sent_as} has {got} bytes, {want} belong there")
 
 
 def _check_column(s: Schema, f: Field, values: dict[str, Any]) -> None:
@@ -272,16 +307,17 @@ def _check_column(s: Schema, f: Field, values: dict[str, Any]) -> None:
     a = values[f.name]
     if a.size == 0:
         return
-    if (f.finite is True or (f.finite and values[f.finite])) and not np.isfinite(a).all():
+    lo, hi = a.min(), a.max()  # NaN where one is
+    if (f.finite is True or (f.finite and values[f.finite])) and not (math.isfinite(lo) and math.isfinite(hi)):
         raise WireError("wire.not_finite", f"{s.name}: {f.name} holds NaN or inf")
     wrong = (
-        (f.min is not None and a.min() < f.min)
-        or (f.max is not None and a.max() > f.max)
-        or (f.above is not None and not a.min() > f.above)
-        or (f.below and a.max() >= values[f.below])
+        (f.min is not None and lo < f.min)
+        or (f.max is not None and hi > f.max)
+        or (f.above is not None and not lo > f.above)
+        or (f.below and hi >= values[f.below])
     )
     if wrong:
-        raise WireError("wire.bounds", f"{s.name}: {f.name} holds {a.min()} .. {a.max()}")
+        raise WireError("wire.bounds", f"{s.name}: {f.name} holds {lo} .. {hi}")
     if f.order == "increasing" and not (a[1:] > a[:-1]).all():
         raise WireError("wire.time_backwards" if f.name.endswith("t_ns") else "wire.order", f"{s.name}: {f.name}")
 
@@ -302,49 +338,52 @@ _READ: dict[str, Callable[[Schema, Field, dict[str, Any], dict[str, int]], Any]]
 _PLAIN: dict[str, Callable[[Any], Any]] = {"int": operator.index, "float": float, "bool": bool, "str": str}
 
 
-def _write_plain(s: Schema, f: Field, value: Any, tree: dict[str, Any], sizes: dict[str, int]) -> None:
+def _write_plain(f: Field, value: Any, out: _Writer) -> None:
     """A scalar; numpy's scalars become Python's."""
     try:
-        tree[f.name] = _PLAIN[f.kind](value)
+        out.put(f.name, _PLAIN[f.kind](value))
     except TypeError:
-        raise WireError("wire.field_type", f"{s.name}: {f.name} = {_short(value)}") from None
+        raise WireError("wire.field_type", f"{out.s.name}: {f.name} = {_short(value)}") from None
 
 
-def _write_map(s: Schema, f: Field, value: Any, tree: dict[str, Any], sizes: dict[str, int]) -> None:
+def _write_map(f: Field, value: Any, out: _Writer) -> None:
     plain = _PLAIN[f.values]
-    tree[f.name] = {str(k): plain(v) for k, v in value.items()}
+    out.put(f.name, {str(k): plain(v) for k, v in value.items()})
 
 
-def _write_column(s: Schema, f: Field, value: Any, tree: dict[str, Any], sizes: dict[str, int]) -> None:
+def _write_column(f: Field, value: Any, out: _Writer) -> None:
     assert f.dtype is not None
-    _check_array(s, f, value, f.dtype, sizes)
-    tree[f.name] = np.ascontiguousarray(value, f.dtype).data
+    _check_array(f, value, f.dtype, out)
+    out.put_column(f.name, np.ascontiguousarray(value, f.dtype).data)
 
 
-def _write_times(s: Schema, f: Field, value: Any, tree: dict[str, Any], sizes: dict[str, int]) -> None:
-    _check_array(s, f, value, np.dtype("<i8"), sizes)
-    base = int(value.min()) if value.size else int(tree["t_ns"])
-    if value.size and int(value.max()) - base > 2**32 - 1:
-        span_s = (int(value.max()) - base) * 1e-9
+def _write_times(f: Field, value: Any, out: _Writer) -> None:
+    _check_array(f, value, _TIMES, out)
+    base, last = (int(value.min()), int(value.max())) if value.size else (int(out.t_ns),) * 2
+    if last - base > 2**32 - 1:
+        span_s = (last - base) * 1e-9
         raise WireError(
-            "wire.span", f"{s.name}: {f.name} spans {span_s:.3f} s, at most 4.294 s fit; split the packet"
+            "wire.span", f"{out.s.name}: {f.name} spans {span_s:.3f} s, at most 4.294 s fit; split the packet"
         )
-    tree[f.base] = base
-    # In one pass: the difference fits, as was checked.
-    tree[f.offsets] = np.subtract(value, base, out=np.empty(value.shape, _U32), casting="unsafe").data
+    out.put(f.base, base)
+    # Modulo 2^32, which is the difference itself, as it fits.
+    offsets = value.astype(OFFSET, order="C")
+    offsets -= OFFSET.type(base % 2**32)
+    out.put_column(f.offsets, offsets.data)
 
 
-def _check_array(s: Schema, f: Field, value: Any, dtype: np.dtype[Any], sizes: dict[str, int]) -> None:
-    if not isinstance(value, np.ndarray) or value.dtype != dtype:
+def _check_array(f: Field, value: Any, dtype: np.dtype[Any], out: _Writer) -> None:
+    if type(value) is not np.ndarray or value.dtype != dtype:
         got = value.dtype if isinstance(value, np.ndarray) else type(value).__name__
-        raise WireError("wire.dtype", f"{s.name}: {f.name} must be an array of {dtype}, got {got}")
-    want = tuple(part if isinstance(part, int) else sizes.get(part, -1) for part in f.shape)
-    if len(value.shape) != len(want) or any(w not in (-1, g) for w, g in zip(want, value.shape, strict=True)):
-        raise WireError("wire.shape", f"{s.name}: {f.name} must be {list(f.shape)}, got {value.shape}")
-    sizes.update({part: got for part, got in zip(f.shape, value.shape, strict=True) if isinstance(part, str)})
+        raise WireError("wire.dtype", f"{out.s.name}: {f.name} must be an array of {dtype}, got {got}")
+    fits = value.ndim == len(f.shape)
+    for part, got in zip(f.shape, value.shape, strict=False):
+        fits &= got == (part if isinstance(part, int) else out.sizes.setdefault(part, got))
+    if not fits:
+        raise WireError("wire.shape", f"{out.s.name}: {f.name} must be {list(f.shape)}, got {value.shape}")
 
 
-_WRITE: dict[str, Callable[[Schema, Field, Any, dict[str, Any], dict[str, int]], None]] = {
+_WRITE: dict[str, Callable[[Field, Any, _Writer], None]] = {
     "int": _write_plain,
     "float": _write_plain,
     "bool": _write_plain,

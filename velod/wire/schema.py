@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib.resources import files
 from typing import Any, get_args
@@ -14,6 +14,8 @@ import numpy as np
 from velod import types
 
 VERSION = 1
+OFFSET = np.dtype("<u4")
+"""Of the column that times are sent as."""
 MESSAGE_TYPES: dict[str, type[Any]] = {cls.__name__: cls for cls in get_args(types.Message)}
 
 
@@ -59,6 +61,12 @@ class Field:
     optional: bool = False  # came after the first messages of this version: may be missing ...
     default: Any = None  # ... and is then this; of every element of a column
 
+    # What follows from the above, worked out once.
+    sent_as: str = ""  # name of what is sent: of the scalar, or of the column
+    counts_rows: str = ""  # name of the dim that the column's length says, if it does
+    row_bytes: int = 0  # of one row of the column
+    promises: bool = False  # whether a decoder has to look at a column's values
+
 
 @dataclass(frozen=True, slots=True)
 class Schema:
@@ -74,15 +82,16 @@ class Schema:
 def schema(message: str) -> Schema:
     """The schema of a message, e.g. ``schema("EventPacket")``."""
     tree = json.loads(files("velod.schemas").joinpath(f"{message}.v{VERSION}.json").read_text("utf-8"))
+    dims = {name: Dim(name, d["sent"], d["max"]) for name, d in tree["dims"].items()}
     return Schema(
         name=tree["schema"],
         version=tree["version"],
-        fields=tuple(_field(f) for f in tree["fields"]),
-        dims={name: Dim(name, d["sent"], d["max"]) for name, d in tree["dims"].items()},
+        fields=tuple(_field(f, dims) for f in tree["fields"]),
+        dims=dims,
     )
 
 
-def _field(tree: dict[str, Any]) -> Field:
+def _field(tree: dict[str, Any], dims: dict[str, Dim]) -> Field:
     known = {k: v for k, v in tree.items() if k not in ("unit", "frame", "doc")}
     for key in ("shape", "choices"):
         known[key] = tuple(known.get(key, ()))
@@ -92,4 +101,17 @@ def _field(tree: dict[str, Any]) -> Field:
         known["optional"] = True
         if known["default"] is None:
             known["default"] = math.nan  # which JSON cannot say
-    return Field(**known)
+    return _derived(Field(**known), dims)
+
+
+def _derived(f: Field, dims: dict[str, Dim]) -> Field:
+    """The field with what follows from it."""
+    rows = f.shape[0] if f.shape else 0
+    itemsize = OFFSET.itemsize if f.offsets else f.dtype.itemsize if f.dtype else 0
+    return replace(
+        f,
+        sent_as=f.offsets or f.name,
+        counts_rows=rows if isinstance(rows, str) and not dims[rows].sent else "",
+        row_bytes=itemsize * math.prod(part for part in f.shape[1:] if isinstance(part, int)),
+        promises=any((f.finite, f.order, f.below)) or any(limit is not None for limit in (f.min, f.max, f.above)),
+    )
