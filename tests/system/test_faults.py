@@ -5,8 +5,11 @@ Every fault, one by one, with its cost: ``python -m tests.system.faults``.
 
 from __future__ import annotations
 
+import json
 import os
 import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -14,15 +17,16 @@ import numpy as np
 import pytest
 
 from tests import slanted_scene
+from tests.system.chatter import HUB
 from tests.system.faults import FRESH_MS, Cost
 from tests.system.hosts import Network, why_not
-from tests.system.rig import Rig, Seen, Stalls
+from tests.system.rig import PORT, Rig, Seen, Stalls
 
 pytestmark = [pytest.mark.system, pytest.mark.skipif(bool(why_not()), reason=why_not())]
 HOLE_S = 5.0
+CHATTER = Path(__file__).with_name("chatter.py")
 
 
-@pytest.mark.long  # and, since a bystander sometimes misses seconds, known to fail: docs/distribution.md
 def test_what_befalls_one_consumer_is_no_other_s_concern(tmp_path: Path) -> None:
     """One behind 1 % loss, 5 ms and 100 Mbit; two in a black hole for 5 s; one that stops for 10 s; one untouched.
 
@@ -59,6 +63,35 @@ def test_what_befalls_one_consumer_is_no_other_s_concern(tmp_path: Path) -> None
     assert Cost.of(seen["stopped"], (began_ns, awake_ns)).back_s <= 2.0 + busy_s
     for name in names:
         assert_fresh(seen[name], busy_s)
+
+
+def test_peers_that_fall_off_the_network_stop_no_other_s_link(tmp_path: Path) -> None:
+    """Links of three are given up at once, with data on their way, as many as Zenoh has receiving threads and more.
+
+    Where the kernel lingers over such a link, nobody receives anything for 5 s.
+    """
+    holed = ("holed-0", "holed-1", "holed-2")
+    with Network("hub", "far", "near") as network, Stalls() as stalls:
+        endpoint = f"tcp/{network['hub'].address}:{PORT}"
+
+        def start(host: str, name: str, seconds: float) -> subprocess.Popen[str]:
+            return network[host].start(
+                [sys.executable, str(CHATTER), endpoint, name, str(seconds)], stdout=subprocess.PIPE
+            )
+
+        hub = start("hub", HUB, 14.0)
+        peers = {name: start("far", name, 12.0) for name in holed} | {"bystander": start("near", "bystander", 12.0)}
+        time.sleep(3.0)
+        network["far"].black_hole(swallows=True)
+        time.sleep(HOLE_S)
+        network["far"].black_hole(swallows=False)
+        gaps_s = {name: json.loads(peer.communicate(timeout=30.0)[0]) for name, peer in peers.items()}
+        gaps_s[HUB] = json.loads(hub.communicate(timeout=30.0)[0])
+    busy_s = 2.0 * stalls.longest_s
+    assert gaps_s["bystander"][HUB] <= 0.5 + busy_s
+    assert gaps_s[HUB]["bystander"] <= 0.5 + busy_s
+    for name in holed:
+        assert HOLE_S - 1.0 <= gaps_s[HUB][name] <= HOLE_S + 2.0 + busy_s  # cut off indeed, and back
 
 
 def assert_fresh(seen: Seen, busy_s: float) -> None:

@@ -8,6 +8,7 @@ import pytest
 
 from velod.cli import main
 from velod.config import ZenohSettings
+from velod.runtime import session
 from velod.runtime.endpoints import is_loopback, refuse_what_is_open
 from velod.runtime.router import router_config
 from velod.runtime.session import SessionError, load_config, open_session
@@ -78,6 +79,7 @@ def test_a_configuration_file_that_is_open_is_refused(text: str, reason: str, tm
 
 def test_the_setting_opens_the_door(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("zenoh.open", lambda config: config)
+    monkeypatch.setattr(session, "keep_from_blocking", lambda opened: None)
     config = open_session(ZenohSettings(listen="tcp/0.0.0.0:17447", insecure=True), introducer=True)
     assert "tcp/0.0.0.0:17447" in config.get_json("listen/endpoints")
 

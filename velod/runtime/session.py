@@ -11,7 +11,6 @@ role do what ``access`` says.
 from __future__ import annotations
 
 import json
-import os
 import re
 import socket
 from collections.abc import Sequence
@@ -24,16 +23,13 @@ from velod.config import ZenohSettings
 from velod.runtime.access import SERVER, access_control, size_limits
 from velod.runtime.endpoints import ANY_HOST, Endpoint, SessionError, parse, refuse_what_is_open
 from velod.runtime.key_paths import KeyPaths
+from velod.runtime.links import keep_from_blocking
 from velod.wire.codec import MAX_BYTES
 
 __all__ = ["SessionError", "introducer_endpoint", "open_session"]
 
 CLIENT_WAIT_MS = 5000
 """So long may a client's first connection take."""
-RECEIVING_THREADS = 16
-"""Giving up a link with data on its way blocks one of Zenoh's receiving threads for up to 10 s (SO_LINGER). With its
-default of two, a pair of consumers that fall off the network stops all reception everywhere. Idle ones cost nothing.
-"""
 
 
 def open_session(settings: ZenohSettings, introducer: bool = False, rigs: Sequence[str] = ()) -> zenoh.Session:
@@ -50,12 +46,12 @@ def open_session(settings: ZenohSettings, introducer: bool = False, rigs: Sequen
 
 def open_config(config: zenoh.Config, settings: ZenohSettings, introducer: bool = False) -> zenoh.Session:
     """Open a session with a configuration that was made from ``settings``. Raises SessionError."""
-    # Zenoh reads this when the process opens its first session; a user's own choice stays.
-    os.environ.setdefault("ZENOH_RUNTIME", f"(rx: (worker_threads: {RECEIVING_THREADS}))")
     try:
-        return zenoh.open(config)
+        session = zenoh.open(config)
     except zenoh.ZError as e:
         raise SessionError(_explain(str(e), settings, introducer)) from None
+    keep_from_blocking(session)
+    return session
 
 
 def introducer_endpoint(settings: ZenohSettings) -> str:

@@ -1,0 +1,85 @@
+"""What Zenoh has no settings for: how the TCP sockets of its links behave when the other side is lost.
+
+Zenoh asks the kernel to linger: to close a link whose other side has fallen off the network then blocks one of its
+threads for 10 s, and with it whatever that thread had to do next for others. Here each link's socket, found among
+those of this process as soon as Zenoh reports the link, is told not to. Linux only; elsewhere Zenoh's ways stay.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import socket
+import struct
+import sys
+from collections.abc import Iterator
+from contextlib import suppress
+from typing import Final
+
+import zenoh
+
+RETRANSMIT_MIN_US: Final = 20_000
+"""After the round trip, how long at least until a segment is sent again. The kernel's 200 ms would keep a velocity,
+and all those behind it, for longer than it is of use; its other means need later segments to arrive first."""
+
+_TCP_RTO_MIN_US: Final = 45  # linux/tcp.h since 6.15; Python has no name for it
+_NO_LINGER: Final = struct.pack("ii", 0, 0)
+_FILES: Final = "/proc/self/fd"
+_LOCATOR = re.compile(r"(?:tcp|tls)/\[?(?P<host>[^\]]+?)\]?:(?P<port>\d+)(?:[?#].*)?")
+
+
+def keep_from_blocking(session: zenoh.Session) -> None:
+    """Set the options of all TCP links of ``session``, those to come included, as long as it is open."""
+    if sys.platform != "linux":
+        return
+
+    def changed(event: zenoh.LinkEvent) -> None:
+        if event.kind == zenoh.SampleKind.PUT:
+            set_options(event.link.src, event.link.dst)
+
+    callback = zenoh.handlers.Callback(changed, indirect=False)
+    session.info.declare_link_events_listener(callback, history=True)
+
+
+def set_options(src: str, dst: str) -> int:
+    """Set the options of this process's sockets from locator ``src`` to ``dst``; returns how many there are."""
+    ends = (_address(src), _address(dst))
+    if None in ends:
+        return 0  # a link of another kind
+    found = 0
+    for link in _tcp_sockets():
+        with link:
+            if ends == _ends(link):
+                link.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _NO_LINGER)
+                with suppress(OSError):  # an older kernel
+                    link.setsockopt(socket.IPPROTO_TCP, _TCP_RTO_MIN_US, RETRANSMIT_MIN_US)
+                found += 1
+    return found
+
+
+def _address(locator: str) -> tuple[str, int] | None:
+    match = _LOCATOR.fullmatch(locator)
+    return (match["host"], int(match["port"])) if match is not None else None
+
+
+def _ends(link: socket.socket) -> tuple[tuple[str, int], tuple[str, int]] | None:
+    try:
+        return link.getsockname()[:2], link.getpeername()[:2]
+    except OSError:
+        return None  # not connected
+
+
+def _tcp_sockets() -> Iterator[socket.socket]:
+    """Duplicates of this process's TCP sockets, to be closed."""
+    for name in os.listdir(_FILES):
+        try:
+            if not os.readlink(f"{_FILES}/{name}").startswith("socket:"):
+                continue
+            descriptor = os.dup(int(name))
+        except OSError:
+            continue  # closed a moment ago
+        duplicate = socket.socket(fileno=descriptor)
+        if duplicate.family in (socket.AF_INET, socket.AF_INET6) and duplicate.type == socket.SOCK_STREAM:
+            yield duplicate
+        else:
+            duplicate.close()
