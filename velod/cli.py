@@ -127,6 +127,12 @@ def _top(args: argparse.Namespace) -> int:
     return top(args.config, cli_network.way_of(args), once=args.once)
 
 
+def _doctor(args: argparse.Namespace) -> int:
+    from velod.cli_doctor import doctor
+
+    return doctor(args.config, args.calibration, cli_network.way_of(args), args.json)
+
+
 def _view(args: argparse.Namespace) -> int:
     from velod.cli_view import view
 
@@ -204,6 +210,7 @@ first steps:
         _add_odometry,
         _add_top,
         _add_view,
+        _add_doctor,
         _add_router,
         _add_config,
         _add_bench,
@@ -475,6 +482,27 @@ def _add_view(commands: _Commands[argparse.ArgumentParser]) -> None:
     parser.add_argument("--save", metavar="FILE", help="write a recording for the viewer instead of opening it")
     parser.add_argument("--seconds", type=_seconds, metavar="S", help="stop after S seconds (default: never)")
     parser.add_argument("--port", type=int, default=9876, help="of the viewer on loopback (default 9876)")
+
+
+def _add_doctor(commands: _Commands[argparse.ArgumentParser]) -> None:
+    parser = _command(
+        commands,
+        "doctor",
+        _doctor,
+        "Whether this machine, this installation and these settings are fit for velod.",
+        "A line for each thing: OK, WARN (it works, but ...) or FAIL, with what to do. Looks at Python and the\n"
+        "packages, compiled kernels, processors, memory and shared memory, the clock, the calibration and the\n"
+        "certificates that the settings name, and at the service, or its port. Changes nothing. Exits with 1 where\n"
+        "something failed.",
+        "  velod doctor                          after installing\n"
+        "  velod doctor -c velod.toml            with your settings: calibration, port and certificates as well\n"
+        "  velod doctor --connect tls/10.0.0.5:17448 --keys /etc/velod/keys\n"
+        "                                        whether this host reaches the velod there\n"
+        "  velod doctor --json -                 for a program",
+    )
+    _add_watch_options(parser)
+    parser.add_argument("--calibration", metavar="FILE", help="instead of rig.calibration")
+    parser.add_argument("--json", metavar="OUT", help="write the findings; - for stdout")
 
 
 def _add_router(commands: _Commands[argparse.ArgumentParser]) -> None:

@@ -157,6 +157,12 @@ def check_keys(folder: str | Path, role: str, rig: str = "") -> KeyPaths:
     return files
 
 
+def days_left(files: KeyPaths, name: str) -> float:
+    """How long a certificate and the CA that signed it are still valid. Raises CertificateError."""
+    ends = min(_read(path).not_valid_after_utc for path in (files.certificate(name), files.ca))
+    return (ends - dt.datetime.now(dt.UTC)) / dt.timedelta(days=1)
+
+
 def _check_dates(certificate: x509.Certificate, path: Path) -> None:
     now = dt.datetime.now(dt.UTC)
     if now > certificate.not_valid_after_utc:
