@@ -12,7 +12,7 @@ from llvmlite import binding
 
 from velod.config import Settings
 from velod.depth import zncc
-from velod.events import selection
+from velod.events import sae, selection
 from velod.flow import kernel
 from velod.ingest import stream
 from velod.runtime.warmup import plain_calibration, warm_up
@@ -22,7 +22,8 @@ PACKED = {
     "the sums of plane fits": ("flow", kernel.fit_flows, r"vfmadd\w+pd\s.*[yz]mm"),
     "correlation": ("depth", zncc._match, r"vfmadd\w+ps\s.*[yz]mm"),
     "the scores' normalisation": ("depth", zncc._match, r"vsqrtpd\s.*[yz]mm"),
-    "the tests for symmetric neighbourhoods": ("ingest", selection._mark_passed, r"vpsub[dq]\s.*[yz]mm"),
+    "the tests for symmetric neighbourhoods": ("ingest", selection._mark_passed, r"vsubps\s.*[yz]mm"),
+    "the encoding of ages": ("ingest", sae._encode_ages, r"vpmul(lq|udq)\s.*[yz]mm"),
     "the checks of a packet": ("ingest", stream._check, r"vpcmp\w+\s.*[yz]mm"),
 }
 

@@ -15,7 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from velod.events.plane_fit import HALF, REACH, SIZE, WIDE_SIZE, fit_plane
-from velod.events.sae import NEVER
+from velod.events.sae import NEVER, enter_last
 from velod.events.selection import GOOD, MAX_ASYMMETRY
 from velod.types import I64, PATCH, U8, U16, U32, WIDE
 
@@ -60,12 +60,9 @@ def enter_and_select(
     _, h, w = first.shape
     low = max(border_px, REACH)
     age = np.empty(SIZE, np.float64)
-    for i in range(t_ns.size):
+    begins = np.empty(t_ns.size, np.int32)
+    for i in begins[: enter_last(x, y, t_ns, p, last, refractory_ns, begins)]:
         k, r, c, t = int(p[i]), int(y[i]), int(x[i]), int(t_ns[i])
-        in_burst = t - last[k, r, c] < refractory_ns
-        last[k, r, c] = t
-        if in_burst:
-            continue
         first[k, r, c] = t
         for dr in range(-REACH, REACH + 1, REACH):
             rm = r - dr

@@ -11,6 +11,7 @@ import math
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from velod.events.plane_fit import HALF, REACH, RING_COLUMN, RING_ROW, SIZE
 from velod.types import I64, PATCH, U8, U16, U32
@@ -19,6 +20,11 @@ NEVER = -(2**62)
 """Stamp of a pixel without events: older than any memory, and far from int64 overflow in differences."""
 
 MAX_U16 = 65_535
+
+BLOCK = 4096
+"""Events that are entered into one surface before the other one's turn comes."""
+
+I32 = NDArray[np.int32]
 
 
 def new_surface(height: int, width: int) -> I64:
@@ -33,11 +39,27 @@ def update_sae(x: U16, y: U16, t_ns: I64, p: U8, first: I64, last: I64, refracto
     An event sooner than ``refractory_ns`` after the last one of its pixel and polarity belongs to that one's burst
     and updates only ``last``. Coordinates and polarities must have been checked.
     """
+    begins = np.empty(min(t_ns.size, BLOCK), np.int32)
+    for start in range(0, t_ns.size, BLOCK):
+        block = slice(start, start + BLOCK)
+        xs, ys, ts, ps = x[block], y[block], t_ns[block], p[block]
+        for i in begins[: enter_last(xs, ys, ts, ps, last, refractory_ns, begins)]:
+            first[ps[i], ys[i], xs[i]] = ts[i]
+
+
+@njit(cache=True, nogil=True)
+def enter_last(x: U16, y: U16, t_ns: I64, p: U8, last: I64, refractory_ns: int, begins: I32) -> int:
+    """Enter events, in time order, into ``last`` (2, h, w); writes which of them begin a burst to ``begins`` (n,).
+
+    Returns how many do. One surface at a time: stores into two by turns take more than twice as long.
+    """
+    n = 0
     for i in range(t_ns.size):
         k, r, c, t = p[i], y[i], x[i], t_ns[i]
-        if t - last[k, r, c] >= refractory_ns:
-            first[k, r, c] = t
+        begins[n] = i
+        n += t - last[k, r, c] >= refractory_ns
         last[k, r, c] = t
+    return n
 
 
 def age_unit_ns(memory_ns: int) -> int:
@@ -45,26 +67,35 @@ def age_unit_ns(memory_ns: int) -> int:
     return math.ceil(memory_ns / MAX_U16)
 
 
+_SHIFT = 46
+"""Divisions by a step are multiplications by 2^46 / step: exact while memory^2 / MAX_U16 < 2^46, up to 2 s."""
+
+
 @njit(cache=True, nogil=True, inline="always")
-def _steps(stamp_ns: int, t_end_ns: int, memory_ns: int, unit_ns: float) -> np.uint16:
-    # In float64 because its division vectorises; the floor is exact for these integers.
-    age = np.int32(min(max(t_end_ns - stamp_ns, 0), memory_ns + 1))
-    steps = np.int32((np.float64(age) + (unit_ns - 1.0)) / unit_ns)
-    return np.uint16(steps) if age <= memory_ns else np.uint16(0)
+def _steps(stamp_ns: int, t_end_ns: int, memory_ns: int, unit_ns: int, per_unit: np.uint64) -> np.uint16:
+    age = min(max(t_end_ns - stamp_ns, 0), memory_ns + 1)
+    within = age if age <= memory_ns else 0
+    # Integer division does not vectorise.
+    return np.uint16(np.uint64(within + unit_ns - 1) * per_unit >> np.uint64(_SHIFT))
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _per_unit(unit_ns: int) -> np.uint64:
+    return np.uint64((1 << _SHIFT) // unit_ns + 1)
 
 
 @njit(cache=True, nogil=True)
 def _encode_ages(stamp: I64, t_end_ns: int, memory_ns: int, unit_ns: int, out: U16) -> None:
-    unit = np.float64(unit_ns)
+    per_unit = _per_unit(unit_ns)
     for i in range(stamp.size):
-        out[i] = _steps(stamp[i], t_end_ns, memory_ns, unit)
+        out[i] = _steps(stamp[i], t_end_ns, memory_ns, unit_ns, per_unit)
 
 
 @njit(cache=True, nogil=True)
 def _encode_newest(a: I64, b: I64, t_end_ns: int, memory_ns: int, unit_ns: int, out: U16) -> None:
-    unit = np.float64(unit_ns)
+    per_unit = _per_unit(unit_ns)
     for i in range(a.size):
-        out[i] = _steps(max(a[i], b[i]), t_end_ns, memory_ns, unit)
+        out[i] = _steps(max(a[i], b[i]), t_end_ns, memory_ns, unit_ns, per_unit)
 
 
 def encode_ages(stamp: I64, t_end_ns: int, memory_ns: int) -> U16:

@@ -27,6 +27,7 @@ MAX_ASYMMETRY = 0.5
 """Neighbourhoods less symmetric than this about the event are not worth a fit (0: a plane, 1: half an edge)."""
 
 I32 = NDArray[np.int32]
+U64 = NDArray[np.uint64]
 
 PAPER_MIN_NEIGHBOURS = 16
 """Sec. V-A, rule 2: more than 15 neighbours in the 5x5 window."""
@@ -68,14 +69,15 @@ def select_burst(
     unit_ns = age_unit_ns(memory_ns)
     span = -((t_start_ns - t_end_ns) // unit_ns)
     oldest = memory_ns // 2 // unit_ns
+    border_px = max(border_px, REACH)
     chosen = np.empty(0, np.int32)
     for reach_px, since, until in ((REACH, span, 0), (HALF, 2 * span, span)):
         room = quota - len(chosen)
         if room > 0:
-            mask = np.zeros(first.shape, np.uint8)
-            _mark_passed(encoded, reach_px, oldest, since, until, oldest - span, mask)
+            mask, marks = _new_mask(first)
+            _mark_passed(encoded, border_px, reach_px, oldest, since, until, oldest - span, mask)
             more = _choose(
-                first, mask, t_end_ns, memory_ns, border_px, room, seq,
+                first, marks, t_end_ns, memory_ns, room, seq,
                 True, reject_px, rejections, min_neighbours, max_rms_px, taken,
             )  # fmt: skip
             taken.reshape(-1)[more] = first.reshape(-1)[more]
@@ -99,10 +101,13 @@ def select_paper(
     Kept are events in [t_start_ns, t_end_ns) that are (1) ``border_px`` inside, (2) have more than 15 neighbours
     and (3) differ from the neighbours' mean time by at most ``time_share`` of the batch's duration.
     """
-    mask = ((last >= t_start_ns) & (last < t_end_ns)).view(np.uint8)
+    mask, marks = _new_mask(last)
+    border_px = max(border_px, REACH)
+    inside = np.s_[:, border_px:-border_px, border_px:-border_px]
+    mask[inside] = (last[inside] >= t_start_ns) & (last[inside] < t_end_ns)
     none_taken = np.full(last.shape, NEVER, np.int64)
     chosen = _choose(
-        last, mask, t_end_ns, memory_ns, border_px, quota, seq,
+        last, marks, t_end_ns, memory_ns, quota, seq,
         False, time_share * (t_end_ns - t_start_ns) * 1e-9, 0, PAPER_MIN_NEIGHBOURS, math.inf, none_taken,
     )  # fmt: skip
     return _columns(chosen, last)
@@ -111,6 +116,12 @@ def select_paper(
 def cell_side_px(height: int, width: int, quota: int) -> int:
     """Side of the coarse grid's cells: about as many cells as events wanted."""
     return max(1, round(math.sqrt(height * width / quota)))
+
+
+def _new_mask(surface: I64) -> tuple[U8, U64]:
+    """Zeros of the shape of ``surface``, a byte each, and the same memory eight at a time, with as many more."""
+    marks = np.zeros(-(-surface.size // 8), np.uint64)
+    return marks.view(np.uint8)[: surface.size].reshape(surface.shape), marks
 
 
 def _columns(chosen: I32, surface: I64) -> tuple[U16, U16, U8]:
@@ -122,10 +133,9 @@ def _columns(chosen: I32, surface: I64) -> tuple[U16, U16, U8]:
 
 def _choose(
     surface: I64,
-    mask: U8,
+    marks: U64,
     t_end_ns: int,
     memory_ns: int,
-    border_px: int,
     quota: int,
     seq: int,
     burst: bool,
@@ -135,7 +145,7 @@ def _choose(
     max_rms_px: float,
     taken: I64,
 ) -> I32:
-    """Flat indices into ``surface`` of at most ``quota`` events out of those marked.
+    """Flat indices into ``surface`` of at most ``quota`` events out of those marked (see ``_new_mask``).
 
     ``tolerance`` is that of the rule: ``reject_px`` for bursts, seconds about the neighbours' mean for the paper's.
     """
@@ -144,7 +154,7 @@ def _choose(
     columns = -(-w // cell_px)
     index = np.empty(surface.size, np.int32)
     cell_end = np.zeros(columns * -(-h // cell_px) + 1, np.int32)
-    _candidates(surface, taken, mask, max(border_px, REACH), cell_px, columns, index, cell_end)
+    _candidates(surface, taken, marks, cell_px, columns, index, cell_end)
     chosen = np.empty(quota, np.int32)
     n = _take_in_turn(
         surface, t_end_ns, memory_ns, burst, tolerance, rejections, min_neighbours,
@@ -154,7 +164,9 @@ def _choose(
 
 
 @njit(cache=True, nogil=True)
-def _mark_passed(age: U16, reach_px: int, oldest: int, since: int, until: int, slow: int, mask: U8) -> None:
+def _mark_passed(
+    age: U16, border_px: int, reach_px: int, oldest: int, since: int, until: int, slow: int, mask: U8
+) -> None:
     """Mark pixels whose eight neighbours ``reach_px`` away lie symmetrically about them in time, as on a plane.
 
     A filter that vectorises, and spares most of the fits. The pixel's ``age`` must be below ``oldest``, that of its
@@ -162,15 +174,18 @@ def _mark_passed(age: U16, reach_px: int, oldest: int, since: int, until: int, s
     the middle to ``REACH``; all in encoded steps, of which 0 counts as oldest.
     """
     _, h, w = age.shape
-    n = w - 2 * reach_px
+    # Single precision holds the sums of a few steps exactly, in lanes half as wide as those of integers would be.
+    oldest_, since_, until_ = np.float32(oldest), np.float32(since), np.float32(until)
+    slow_ = np.float32(slow) * np.float32(reach_px)
+    west, east = border_px - reach_px, border_px + reach_px
+    n = w - 2 * border_px
     for k in range(2):
-        for r in range(reach_px, h - reach_px):
+        for r in range(border_px, h - border_px):
             up, row, down = age[k, r - reach_px], age[k, r], age[k, r + reach_px]
-            marks = mask[k, r, reach_px : w - reach_px]
-            w0, e0 = row[:n], row[2 * reach_px :]
-            nw, n0, ne = up[:n], up[reach_px : w - reach_px], up[2 * reach_px :]
-            sw, s0, se = down[:n], down[reach_px : w - reach_px], down[2 * reach_px :]
-            c0 = row[reach_px : w - reach_px]
+            marks = mask[k, r, border_px : w - border_px]
+            w0, c0, e0 = row[west:], row[border_px:], row[east:]
+            nw, n0, ne = up[west:], up[border_px:], up[east:]
+            sw, s0, se = down[west:], down[border_px:], down[east:]
             for i in range(n):
                 t = _oldest_if_none(c0[i])
                 a, b = _oldest_if_none(w0[i]) - t, _oldest_if_none(e0[i]) - t
@@ -179,35 +194,48 @@ def _mark_passed(age: U16, reach_px: int, oldest: int, since: int, until: int, s
                 g, j = _oldest_if_none(ne[i]) - t, _oldest_if_none(sw[i]) - t
                 symmetric = abs(a + b) + abs(c + d) + abs(e + f) + abs(g + j)
                 antisymmetric = abs(a - b) + abs(c - d) + abs(e - f) + abs(g - j)
-                plane = np.float32(symmetric) <= np.float32(MAX_ASYMMETRY) * np.float32(antisymmetric)
+                plane = symmetric <= np.float32(MAX_ASYMMETRY) * antisymmetric
                 newest = min(min(min(a, b), min(c, d)), min(min(e, f), min(g, j)))
                 passed = newest + t
-                waited = (passed >= until) | (REACH * (t - passed) > slow * reach_px)
-                marks[i] = np.uint8(plane & (t < oldest) & (passed < since) & waited)
+                waited = (passed >= until_) | (np.float32(REACH) * (t - passed) > slow_)
+                marks[i] = np.uint8(plane & (t < oldest_) & (passed < since_) & waited)
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _oldest_if_none(age: np.uint16) -> np.int32:
-    return np.int32(np.uint16(age - np.uint16(1)))
+def _oldest_if_none(age: np.uint16) -> np.float32:
+    return np.float32(np.uint16(age - np.uint16(1)))
 
 
 @njit(cache=True, nogil=True)
-def _candidates(
-    surface: I64, taken: I64, mask: U8, border_px: int, cell_px: int, columns: int, index: I32, cell_end: I32
-) -> None:
-    """Flat indices of marked and untaken stamps, sorted by cell: cell c is index[cell_end[c] : cell_end[c + 1]]."""
+def _candidates(surface: I64, taken: I64, marks: U64, cell_px: int, columns: int, index: I32, cell_end: I32) -> None:
+    """Flat indices of marked and untaken stamps, sorted by cell: cell c is index[cell_end[c] : cell_end[c + 1]].
+
+    ``marks`` as of ``_new_mask``. What is found is written whether it counts or not, and overwritten if not: a branch
+    would be mistaken too often.
+    """
     _, h, w = surface.shape
-    found = np.empty(surface.size, np.int32)
-    cell = np.empty(surface.size, np.int32)
+    stamp, stamp_taken = surface.reshape(-1), taken.reshape(-1)
+    word = np.empty(marks.size, np.int32)
     n = 0
-    for k in range(2):
-        for r in range(border_px, h - border_px):
-            for c in range(border_px, w - border_px):
-                if mask[k, r, c] and surface[k, r, c] != taken[k, r, c]:
-                    found[n] = (k * h + r) * w + c
-                    cell[n] = r // cell_px * columns + c // cell_px
-                    cell_end[cell[n] + 1] += 1
-                    n += 1
+    for i in range(marks.size):
+        word[n] = i
+        n += marks[i] != 0
+    found, cell = np.empty(surface.size + 1, np.int32), np.empty(surface.size + 1, np.int32)
+    m = 0
+    for i in word[:n]:
+        for j in range(8):
+            found[m] = 8 * i + j
+            m += np.int64(marks[i] >> np.uint64(8 * j) & np.uint64(1))
+    row_cell = np.arange(2 * h) % h // cell_px * columns
+    column_cell = np.arange(w) // cell_px
+    n = 0
+    for at in found[:m]:
+        r = np.uint32(at) // np.uint32(w)
+        found[n] = at
+        cell[n] = row_cell[r] + column_cell[at - r * w]
+        n += stamp[at] != stamp_taken[at]
+    for c in cell[:n]:
+        cell_end[c + 1] += 1
     for i in range(1, cell_end.size):
         cell_end[i] += cell_end[i - 1]
     fill = cell_end[:-1].copy()

@@ -152,7 +152,11 @@ def _check(
     """Copy the events that are on the sensor, of polarity 0 or 1, in time order, in a kept row; returns how many."""
     n = t_ns.size
     if band_rows >= BAND_ROWS and _are_good(x, y, t_ns, p, width, height, not_before_ns):
-        out_x[:], out_y[:], out_t_ns[:], out_p[:] = x, y, t_ns, p
+        # One by one: all in one statement they are copied twice.
+        out_x[:] = x
+        out_y[:] = y
+        out_t_ns[:] = t_ns
+        out_p[:] = p
         return n
     n = 0
     for i in range(t_ns.size):
@@ -175,16 +179,18 @@ def _check(
 @njit(cache=True, nogil=True)
 def _are_good(x: U16, y: U16, t_ns: I64, p: U8, width: int, height: int, not_before_ns: int) -> bool:
     """Whether there is nothing to drop, as nearly always; loops that vectorise, a column each."""
-    bad = t_ns.size > 0 and t_ns[0] < not_before_ns
+    if t_ns.size == 0:
+        return True
+    last_x, last_y, highest_p, backwards = np.uint16(0), np.uint16(0), np.uint8(0), False
     for i in range(x.size):
-        bad |= x[i] >= width
+        last_x = max(last_x, x[i])
     for i in range(y.size):
-        bad |= y[i] >= height
+        last_y = max(last_y, y[i])
     for i in range(p.size):
-        bad |= p[i] > 1
+        highest_p = max(highest_p, p[i])
     for i in range(1, t_ns.size):
-        bad |= t_ns[i] < t_ns[i - 1]
-    return not bad
+        backwards |= t_ns[i] < t_ns[i - 1]
+    return last_x < width and last_y < height and highest_p < 2 and not backwards and t_ns[0] >= not_before_ns
 
 
 @njit(cache=True, nogil=True)
