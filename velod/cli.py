@@ -133,6 +133,12 @@ def _doctor(args: argparse.Namespace) -> int:
     return doctor(args.config, args.calibration, cli_network.way_of(args), args.json)
 
 
+def _record(args: argparse.Namespace) -> int:
+    from velod.cli_record import record
+
+    return record(args.config, args.file, args.topics, cli_network.way_of(args), args.calibration, args.seconds)
+
+
 def _view(args: argparse.Namespace) -> int:
     from velod.cli_view import view
 
@@ -209,6 +215,7 @@ first steps:
         _add_echo,
         _add_odometry,
         _add_top,
+        _add_record,
         _add_view,
         _add_doctor,
         _add_router,
@@ -482,6 +489,32 @@ def _add_view(commands: _Commands[argparse.ArgumentParser]) -> None:
     parser.add_argument("--save", metavar="FILE", help="write a recording for the viewer instead of opening it")
     parser.add_argument("--seconds", type=_seconds, metavar="S", help="stop after S seconds (default: never)")
     parser.add_argument("--port", type=int, default=9876, help="of the viewer on loopback (default 9876)")
+
+
+def _add_record(commands: _Commands[argparse.ArgumentParser]) -> None:
+    parser = _command(
+        commands,
+        "record",
+        _record,
+        "What a rig sends, into a file, until Ctrl-C.",
+        "The suffix says which kind. FILE.h5 takes the sensor streams (events of both cameras, IMU), 13 bytes an\n"
+        "event, for `velod replay` and `velod eval`; it appears when the recording ends. Cameras that are not equal\n"
+        "and aligned do not fit into it: their calibration is written beside it. FILE.mcap takes topics (velocity,\n"
+        "odometry and health unless named): small messages as JSON, which Foxglove and PlotJuggler show, others as\n"
+        "msgpack (docs/messages.md); it needs pip install 'velod[mcap]'. Exits with 1 where messages are missing,\n"
+        "which it counts by their seq, or the disk got full.",
+        "  velod record run.h5                   the sensors of the velod on this host; then velod replay run.h5\n"
+        "  velod record run.mcap --seconds 60    velocity, odometry and health, for a minute\n"
+        "  velod record run.mcap velocity flow depth\n"
+        "                                        these topics\n"
+        "  velod record run.mcap --connect tls/10.0.0.5:17448 --keys /etc/velod/keys\n"
+        "                                        of a velod on another host",
+    )
+    parser.add_argument("file", metavar="FILE", help="*.h5: sensor streams; *.mcap: topics; must not exist yet")
+    parser.add_argument("topics", nargs="*", metavar="TOPIC", help="as for velod echo; with .mcap only")
+    _add_watch_options(parser)
+    parser.add_argument("--calibration", metavar="FILE", help="to put into the file, instead of the service's own")
+    parser.add_argument("--seconds", type=_seconds, metavar="S", help="stop after S seconds (default: never)")
 
 
 def _add_doctor(commands: _Commands[argparse.ArgumentParser]) -> None:

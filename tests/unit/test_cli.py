@@ -22,7 +22,7 @@ from velod.eval.metrics import truth_at
 from velod.geometry.calibration import load_calibration, save_calibration
 from velod.io import open_recording
 
-COMMANDS = ("demo", "run", "replay", "eval", "sim", "echo", "top", "config", "bench", "warmup", "doctor")
+COMMANDS = ("demo", "run", "replay", "eval", "sim", "echo", "top", "config", "bench", "warmup", "doctor", "record")
 EVAL_KEYS = [
     *("ave_mps", "rve_percent", "p95_mps", "n", "first_valid_s", "valid_fraction", "ave_floor_mps", "nees_mean"),
     *("drift_percent", "real_time_factor", "latency_p50_ms", "latency_p99_ms", "median_mps", "rve_median_percent"),

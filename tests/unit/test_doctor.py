@@ -59,7 +59,6 @@ def test_a_port_that_another_program_has_fails(
     monkeypatch.setattr("velod.runtime.settings_service.ANSWER_S", 0.2)
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", port))
-        taken.listen()
         assert main(["doctor", "-c", str(settings_file)]) == 1
     assert "another program has the port" in capsys.readouterr().out
 

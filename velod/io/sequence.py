@@ -17,6 +17,7 @@ from velod.types import F64, I64
 _MODELS = {"radtan": 5, "equi": 4}
 _EVENT_COLUMNS = {"x": np.uint16, "y": np.uint16, "t": np.int64, "p": np.uint8}
 _CHUNK = 1 << 17
+_IMU_CHUNK = 1 << 12
 # Level 1 with byte shuffle: 3 bytes an event instead of 13, read as fast; higher levels take long for little.
 _PACKED = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 
@@ -124,11 +125,12 @@ def write_recording(path: str | Path, data: SequenceData) -> None:
 class RecordingWriter:
     """Writes a sequence file bit by bit; it appears complete or not at all, and equal data give equal bytes.
 
-    Raises RecordingError for what the format cannot hold: cameras that differ or are not aligned, times that are not
-    whole microseconds; and where the file cannot be written.
+    Without a ``calibration`` whoever reads the file has to name one. ``packed=False`` is for live sensors: four times
+    the size, and many times as fast. Raises RecordingError for what the format cannot hold: cameras that differ or
+    are not aligned, times that are not whole microseconds; and where the file cannot be written.
     """
 
-    def __init__(self, path: str | Path, calibration: Calibration) -> None:
+    def __init__(self, path: str | Path, calibration: Calibration | None, *, packed: bool = True) -> None:
         self._path = Path(path)
         self._part = self._path.with_name(f"{self._path.name}.part{os.getpid()}")
         self._pending: dict[str, list[EventColumns]] = {"left": [], "right": []}
@@ -140,14 +142,16 @@ class RecordingWriter:
                 f"{self._path}: cannot be written: {os.strerror(e.errno) if e.errno else e}"
             ) from None
         try:
-            _write_calibration(self._file, calibration, self._path)
+            if calibration is not None:
+                _write_calibration(self._file, calibration, self._path)
         except RecordingError:
             self.close()
             raise
+        options = _PACKED if packed else {}
         for side in self._pending:
             for name, kind in _EVENT_COLUMNS.items():
                 self._file.create_dataset(
-                    f"events/{side}/{name}", (0,), kind, maxshape=(None,), chunks=(_CHUNK,), **_PACKED
+                    f"events/{side}/{name}", (0,), kind, maxshape=(None,), chunks=(_CHUNK,), **options
                 )
 
     def __enter__(self) -> RecordingWriter:
@@ -162,11 +166,23 @@ class RecordingWriter:
         if sum(len(part.t_ns) for part in self._pending[side]) >= _CHUNK:
             self._flush(side)
 
-    def finish(self, imu: Imu, truth: Truth | None = None, depth: DepthTruth | None = None) -> None:
-        """Add the rest and put the file in its place."""
+    def append_imu(self, imu: Imu) -> None:
+        """Add samples of the IMU, in time order, where they come bit by bit as well."""
+        columns = {"t_us": _microseconds(imu.t_ns, self._path), "accel": imu.accel, "gyro": imu.gyro}
+        for name, values in columns.items():
+            if f"imu/{name}" not in self._file:
+                shape = values.shape[1:]
+                self._file.create_dataset(
+                    f"imu/{name}", (0, *shape), values.dtype, maxshape=(None, *shape), chunks=(_IMU_CHUNK, *shape)
+                )
+            _extend(self._file[f"imu/{name}"], values)
+
+    def finish(self, imu: Imu | None, truth: Truth | None = None, depth: DepthTruth | None = None) -> None:
+        """Add the rest and put the file in its place; no ``imu`` where ``append_imu`` was given it."""
         for side in self._pending:
             self._flush(side)
-        self._write_group("imu", imu.t_ns, accel=imu.accel, gyro=imu.gyro)
+        if imu is not None:
+            self._write_group("imu", imu.t_ns, accel=imu.accel, gyro=imu.gyro)
         if truth is not None:
             position = {} if truth.p_WB is None else {"p_WB": truth.p_WB}
             self._write_group(
@@ -195,15 +211,18 @@ class RecordingWriter:
         t_us = _microseconds(np.concatenate([part.t_ns for part in parts]), self._path)
         x, y, p = (np.concatenate([getattr(part, name) for part in parts]) for name in "xyp")
         for name, column in (("x", x), ("y", y), ("t", t_us), ("p", p)):
-            stored = self._file[f"events/{side}/{name}"]
-            stored.resize(len(stored) + len(column), axis=0)
-            stored[len(stored) - len(column) :] = column
+            _extend(self._file[f"events/{side}/{name}"], column)
 
     def _write_group(self, name: str, t_ns: I64, **columns: F64) -> None:
         group = self._file.create_group(name)
         group["t_us"] = _microseconds(t_ns, self._path)
         for column, values in columns.items():
             group[column] = values
+
+
+def _extend(stored: Any, values: Any) -> None:
+    stored.resize(len(stored) + len(values), axis=0)
+    stored[len(stored) - len(values) :] = values
 
 
 def _write_calibration(file: Any, calibration: Calibration, path: Path) -> None:
