@@ -114,6 +114,34 @@ def test_the_solution_in_the_envelope_is_that_of_dense_algebra(segments):
     assert np.abs((solution.cov(F) - Q) / np.sqrt(np.outer(np.diag(Q), np.diag(Q)))).max() < 1e-5
 
 
+def test_eliminating_the_old_states_once_changes_no_solution():
+    """Solutions between factors that come in time, late, and with a new segment, against dense algebra each time."""
+    rng = np.random.default_rng(21)
+    w, fronts = filled(8, rng), []
+
+    def check(t_ns):
+        interval = Interval(t_ns, t_ns + 20_000_000)
+        interval.information[:], interval.until = np.eye(3), interval.t_j
+        interval.blocks[:], interval.r[:] = rng.normal(size=(3, 15)), rng.normal(size=3)
+        H, h = dense(w)
+        more, more_h = dense_twin(w, interval)
+        P = np.linalg.inv(H + more)
+        apart = w.solve([interval], None, 0.0).x - P @ (h + more_h)
+        assert np.abs(apart / np.sqrt(np.diag(P))).max() < 1e-5
+        fronts.append(w._front)
+
+    newest = int((w.last + 0.3) * KNOT_NS)
+    check(newest)
+    J = rng.normal(size=(8, 9))
+    w.add_interval(moment(newest + 7_000_000, J.T @ J, J.T @ rng.normal(size=8)))
+    assert w._front == fronts[0] > 0, "what comes in time leaves the front as it is"
+    check(newest)
+    w.add_interval(moment(newest - 4 * KNOT_NS, J.T @ J, J.T @ rng.normal(size=8)))
+    check(newest)
+    w.extend(exp(rng.normal(size=3)) * 0.1, rng.normal(size=3) * 10, np.zeros(3), 0.1)
+    check(newest + KNOT_NS)
+
+
 def test_an_information_that_determines_nothing_is_refused():
     w = filled(4, np.random.default_rng(1))
     w._H[:] = 0.0

@@ -6,7 +6,8 @@ from scipy import linalg
 
 from tests.synthetic import CALIBRATION, Motion, errors, messages
 from velod.config import from_tree
-from velod.optimizer.degeneracy import TRUSTED, complement, information, weak_directions, without
+from velod.optimizer.degeneracy import TRUSTED, complement, open_directions, weak_directions, without
+from velod.optimizer.flow_equation import Fit, Measured, Rows
 from velod.optimizer.stage import OptimizerStage
 from velod.types import Velocity
 
@@ -59,16 +60,23 @@ def parallel_rows(rng, m, scatter):
     return (c * ax + s * ay) / Z[:, None], (-s * ax + c * ay) / Z[:, None]
 
 
+def weak_of(a, across, scatter):
+    """Weak directions of rows of equal weight whose normals are said to scatter by ``scatter`` rad."""
+    one = np.ones(len(a))
+    rows = Rows(np.arange(len(a)), one, a, a, one * 0.1**-0.5)
+    fit = Fit(np.zeros(3), np.eye(3), one, 1.0, 1.0)
+    return open_directions(rows, Measured(one, one * scatter, one, one), across, fit)
+
+
 def test_scatter_of_the_normals_is_no_information():
     rng = np.random.default_rng(2)
     a, across = parallel_rows(rng, 400, 0.03)
-    weight = np.full(400, 0.1)
-    weak = weak_directions(*information(a, across, np.full(400, 0.03), weight))
+    weak = weak_of(a, across, 0.03)
     assert weak.shape == (1, 3)
     assert abs(weak[0, 1]) > 0.99
     # a tenth of the edges across the others is enough
     a[::10], across[::10] = across[::10], -a[::10]
-    assert weak_directions(*information(a, across, np.full(400, 0.03), weight)).shape == (0, 3)
+    assert weak_of(a, across, 0.03).shape == (0, 3)
 
 
 def test_weak_directions_are_the_generalised_eigenvectors_below_the_limit():

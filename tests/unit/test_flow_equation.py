@@ -6,16 +6,15 @@ from velod.geometry.camera import motion_field_rows
 from velod.geometry.so3 import exp
 from velod.optimizer.flow_equation import (
     BIN_NS,
-    COMMON,
+    MODEL_SIGMA_PX_S,
+    PREDICTED_SHARE,
     Bins,
     Fit,
     Measured,
     Rows,
     body_rows,
-    common,
     compress,
-    on_error,
-    on_velocity,
+    less_known,
     pairs,
     sigmas,
     solve,
@@ -187,36 +186,24 @@ def test_rows_in_the_body_frame_are_those_of_plain_matrix_algebra():
     assert np.allclose(b, nB @ R_CB + np.cross(p_BC_B, a), rtol=1e-6, atol=1e-9)
 
 
-def test_rows_on_the_error_of_the_integrated_velocity_say_the_same():
-    """v_B = R_BL (s_L + e) put into the rows on v_B."""
-    rng = np.random.default_rng(6)
-    m = 40
-    a_B, b_B, w_B, s_L, e = rng.normal(size=(5, m, 3))
-    R_LB, speed = exp(rng.normal(size=(m, 3))), rng.uniform(1, 100, m)
-    rows = on_velocity(np.arange(m), speed, a_B, b_B, w_B)
-    assert np.allclose(rows.z, speed - np.sum(b_B * w_B, axis=1))
-    error = on_error(rows, R_LB, s_L)
-    v_B = np.einsum("kji,kj->ki", R_LB, s_L + e)
-    assert np.allclose(error.z - np.sum(error.a * e, axis=1), rows.z - np.sum(a_B * v_B, axis=1))
+def test_sigmas_are_those_of_plain_algebra():
+    rng = np.random.default_rng(7)
+    speed, sigma, translational, share = rng.uniform(1, 300, (4, 60)) * [[1.0], [0.1], [0.7], [1e-4]]
+    residual = rng.normal(size=60) * 100
+    predicted = np.clip((speed - residual) / speed, *PREDICTED_SHARE)
+    twin = np.sqrt((sigma * predicted) ** 2 + MODEL_SIGMA_PX_S**2 + ((translational - residual) * share) ** 2)
+    assert np.allclose(sigmas(Measured(speed, sigma, translational, share), residual), twin, rtol=1e-12)
 
 
-def test_the_rows_of_common_errors_are_central_differences():
-    """Speeds (1 + scale) [translation (1 + depth scale) + rotation] of a moment that is earlier by the delay."""
-    t = np.linspace(0.0, 1.0, 20)
-
-    def parts(t):
-        return 40.0 * np.sin(3.0 * t), 300.0 * np.cos(2.0 * t)
-
-    def flow(scale, delay, depth_scale):
-        translational, rotational = parts(t - delay)
-        return (1.0 + scale) * (translational * (1.0 + depth_scale) + rotational)
-
-    h = 1e-6
-    rate = (sum(parts(t + h)) - sum(parts(t - h))) / (2 * h)
-    rows = common(*parts(t), rate)
-    for k in range(len(COMMON)):
-        d = np.eye(3)[k] * h
-        assert np.allclose(rows[:, k], (flow(*d) - flow(*-d)) / (2 * h), rtol=1e-6, atol=1e-4), COMMON[k]
+def test_rows_less_what_is_known_are_solved_by_the_rest():
+    """z made of e = known + rest, falling along the slope, and of common errors: what is left is a . rest."""
+    rng = np.random.default_rng(8)
+    rows, c = rows_of(np.zeros(3), np.zeros(3), rng, m=50), rng.normal(size=(50, 3))
+    common, slope, known, rest = rng.normal(size=(4, 3))
+    e = known + rest + np.outer((rows.t_ns - 7_000_000) * 1e-9, slope)
+    rows = Rows(rows.t_ns, np.sum(rows.a * e, axis=1) + c @ common, rows.a, rows.b, rows.sigma)
+    left = less_known(rows, c, common, slope, known, 7_000_000)
+    assert np.allclose(left.z, rows.a @ rest, atol=1e-9) and left.sigma is rows.sigma
 
 
 def test_what_an_error_of_the_angular_velocity_does_to_a_fit_is_a_central_difference():

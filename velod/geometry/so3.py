@@ -111,9 +111,10 @@ def exp_so3(w: F64, out: F64) -> None:
     """``exp`` for kernels: the rotation matrix of the rotation vector w (3,), rad, into out (3, 3)."""
     x, y, z = w[0], w[1], w[2]
     theta2 = x * x + y * y + z * z
-    if theta2 < _SMALL * _SMALL:
-        a = 1.0 + theta2 * (-1.0 / 6.0 + theta2 / 120.0)
-        b = 0.5 + theta2 * (-1.0 / 24.0 + theta2 / 720.0)
+    # 0.1 rad, of which an IMU's samples are less apart; the series is good to 3e-14
+    if theta2 < 0.01:
+        a = 1.0 + theta2 * (-1.0 / 6.0 + theta2 * (1.0 / 120.0 - theta2 / 5040.0))
+        b = 0.5 + theta2 * (-1.0 / 24.0 + theta2 * (1.0 / 720.0 - theta2 / 40320.0))
     else:
         theta = math.sqrt(theta2)
         a = math.sin(theta) / theta

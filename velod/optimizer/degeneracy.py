@@ -26,25 +26,39 @@ SINGULAR = 1e-6
 
 def open_directions(on_error: Rows, measured: Measured, across: F64, fit: Fit) -> F64:
     """Unit vectors (k, 3) in L of what a batch says nothing of, from its rows and those ``across`` (m, 3)."""
-    # the plane's slope errs across as much as along
-    direction_sigma = measured.sigma / measured.speed
-    told = direction_sigma < MAX_DIRECTION_SIGMA
-    if np.count_nonzero(told) < MIN_TOLD:
-        # almost at rest: small flows say that the velocity is small, whichever way they point
-        return np.empty((0, 3))
-    weight = fit.weight / on_error.sigma**2
-    return weak_directions(*information(on_error.a[told], across[told], direction_sigma[told], weight[told]))
+    said, scatter = np.empty((3, 3)), np.empty((3, 3))
+    told = _information(
+        on_error.a, across, measured.sigma, measured.speed, on_error.sigma, fit.weight, said, scatter
+    )  # fmt: skip
+    # almost at rest: small flows say that the velocity is small, whichever way they point
+    return weak_directions(said, scatter) if told >= MIN_TOLD else np.empty((0, 3))
 
 
-def information(a: F64, across: F64, direction_sigma: F64, weight: F64) -> tuple[F64, F64]:
+@njit(cache=True, nogil=True)
+def _information(
+    a: F64, across: F64, speed_sigma: F64, speed: F64, sigma: F64, weight: F64, said: F64, scatter: F64
+) -> int:
     """What rows say of the velocity, (3, 3), and what they would seem to say if their normals only scattered.
 
-    ``a`` (m, 3): n^T A / Z; ``across`` (m, 3): the same for n turned by a right angle; ``direction_sigma`` (m,):
-    of n, rad; ``weight`` (m,): over the variance of the row.
+    ``a`` (m, 3): n^T A / Z; ``across`` (m, 3): the same for n turned by a right angle. Returns how many flows have a
+    direction to speak of.
     """
-    said = (a * weight[:, None]).T @ a
-    scatter = (across * (weight * direction_sigma**2)[:, None]).T @ across
-    return said, scatter
+    said[:, :] = 0.0
+    scatter[:, :] = 0.0
+    told = 0
+    for k in range(speed.size):
+        # the plane's slope errs across as much as along
+        direction_sigma = speed_sigma[k] / speed[k]
+        if not direction_sigma < MAX_DIRECTION_SIGMA:
+            continue
+        told += 1
+        w = weight[k] / (sigma[k] * sigma[k])
+        w_across = w * direction_sigma * direction_sigma
+        for i in range(3):
+            for j in range(3):
+                said[i, j] += w * a[k, i] * a[k, j]
+                scatter[i, j] += w_across * across[k, i] * across[k, j]
+    return told
 
 
 def weak_directions(said: F64, scatter: F64) -> F64:

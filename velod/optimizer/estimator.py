@@ -10,19 +10,20 @@ import numpy as np
 from velod.config import Settings
 from velod.geometry.calibration import Calibration
 from velod.geometry.rectify import rectify
-from velod.geometry.so3 import hat
 from velod.optimizer import attitude, degeneracy, flow_equation, inertial_residual
 from velod.optimizer.attitude import Attitude
 from velod.optimizer.consistency import Consistency
-from velod.optimizer.flow_equation import BIN_NS, RIDGE, Bins, Fit, Measured, Rows
+from velod.optimizer.equations import EquationMaker, Equations, Prediction
+from velod.optimizer.flow_equation import BIN_NS, RIDGE, Bins, Fit, Rows
 from velod.optimizer.frame import Rate
 from velod.optimizer.inertial import InertialMemory
 from velod.optimizer.interval import Interval
 from velod.optimizer.preintegration import Preintegration, preintegrate
+from velod.optimizer.small import squared_distance
 from velod.optimizer.spline import locate
 from velod.optimizer.standstill import QUIET_EVENTS, QUIET_NS, Standstill
 from velod.optimizer.window import Window
-from velod.types import F64, I64, NS_PER_S, DepthBatch, FlowBatch, ImuSamples
+from velod.types import F64, NS_PER_S, DepthBatch, FlowBatch, ImuSamples
 
 OPEN_NS = 60_000_000
 """An interval is open so long for flows of batches to come, which select events up to half the memory old."""
@@ -40,8 +41,6 @@ USUAL_DEPTH = 3.0
 """m, before any was seen."""
 MAX_INTEGRATED = 1000.0
 """m/s; s_L, which gravity makes grow without end, is counted anew beyond this."""
-ACCELERATION_NS = 15_000_000
-"""Accelerations are differences over this time: as short as the gyroscope's noise allows."""
 MAX_CARRIED = 32
 """Predictions of one head that are remembered: a batch asks for some of them twice."""
 MAX_DIRECTION_SIGMA = 0.5
@@ -62,24 +61,18 @@ class Head:
     common: F64  # (3,) common errors of the flows, flow_equation.COMMON
     e_L: F64  # (3,) e of v_B = R_BL (s_L + e), m/s
 
+    def e_at(self, t_ns: int) -> F64:
+        """e (3,) at ``t_ns``, from here on along the slope of gravity."""
+        return self.e_L - (t_ns - self.t_ns) * 1e-9 * self.g_L
+
     @property
     def gravity_direction_sigma(self) -> float:
         """Standard deviation of the direction of g_L, rad."""
-        norm = float(np.linalg.norm(self.g_L))
-        n, cov = self.g_L / norm, self.cov[9:, 9:]
-        # the trace of the covariance across n
-        return math.sqrt(max(float(np.trace(cov) - n @ cov @ n), 0.0)) / norm
-
-
-@dataclass(frozen=True, slots=True)
-class Equations:
-    """The flow equation of a batch: its rows on the spline and on e, and what belongs to them."""
-
-    on_spline: Rows
-    on_error: Rows
-    measured: Measured
-    common: F64  # (m, 3), flow_equation.COMMON
-    across: F64  # (m, 3) the rows on e of normals turned by a right angle
+        g, cov = self.g_L, self.cov[9:, 9:]
+        squared_norm = float(g @ g)
+        # the trace of the covariance across g
+        across = float(cov[0, 0] + cov[1, 1] + cov[2, 2] - g @ cov @ g / squared_norm)
+        return math.sqrt(max(across, 0.0) / squared_norm)
 
 
 class Estimator:
@@ -89,8 +82,8 @@ class Estimator:
         o = settings.optimizer
         rect = rectify(calibration)
         self._o, self._imu = o, settings.imu
-        self._camera = (rect.f, rect.cx, rect.cy)
-        self._R_CB, self._p_BC_B = rect.R_CB, rect.p_BC_B
+        self._f = rect.f
+        self._maker = EquationMaker((rect.f, rect.cx, rect.cy), rect.R_CB, rect.p_BC_B)
         self._knot_ns = int(o.knot_s * NS_PER_S)
         self._interval_ns = int(o.preintegration_s * NS_PER_S)
         self.counters: dict[str, int] = {}
@@ -254,26 +247,6 @@ class Estimator:
         noise = imu.gyro_noise if gyro_noise is None else gyro_noise
         return preintegrate(m.t_ns, m.accel, m.gyro, t_i, t_j, b_a, b_w, imu.accel_noise, noise)
 
-    def _common(self, on_velocity: Rows, on_error: Rows, measured: Measured) -> F64:
-        """Rows (m, 3) of the errors that all flows have in common; 0 before anything is known of the velocity.
-
-        Velocity and gravity are those of the head, angular velocity and accelerations those shortly before the rows.
-        """
-        head, before = self.head, int(on_error.t_ns.min()) - np.array([2, 1, 0]) * ACCELERATION_NS
-        if head is None or before[0] < self.memory.t_ns[0]:
-            return np.zeros((len(on_error.z), 3))
-        translational = (
-            measured.translational - on_error.z + np.sum(on_error.a * self._e(on_error.t_ns, head), axis=1)
-        )
-        R, s_L, _ = self.memory.at(before)
-        dt = ACCELERATION_NS * 1e-9
-        turned = _small_turn(R[0].T @ R[1]), _small_turn(R[1].T @ R[2])
-        e = self._e(before, head)
-        v_dot_B = (R[2].T @ (s_L[2] + e[2]) - R[0].T @ (s_L[0] + e[0])) / (2.0 * dt)
-        w_B, w_dot_B = (turned[0] + turned[1]) / (2.0 * dt), (turned[1] - turned[0]) / dt**2
-        b, a = on_velocity.b, on_velocity.a
-        return flow_equation.common(translational, b @ w_B, a @ v_dot_B + b @ w_dot_B)
-
     def _frame(self, t_ns: int) -> tuple[F64, F64, F64]:
         """R_LB and the affine map from spline to body velocity at ``t_ns``: v_B = N + M spline(t)."""
         R, s, _ = self.memory.at(np.array([t_ns]))
@@ -284,37 +257,19 @@ class Estimator:
 
     def _equations(self, flow: FlowBatch, depth: DepthBatch) -> Equations | None:
         """Of the events of which both flow and depth speak; None where they are too few."""
-        at_flow, at_depth = flow_equation.pairs(flow.index, depth.index)
-        t = flow.t_ns - flow.age[at_flow].astype(np.int64)
-        inside = (t >= self.memory.t_ns[0]) & (self.window.empty | (t >= self.window.first * self._knot_ns))
-        at_flow, at_depth, t = at_flow[inside], at_depth[inside], t[inside]
-        if len(t) < self._o.min_flows:
+        earliest_ns = int(self.memory.t_ns[0])
+        if not self.window.empty:
+            earliest_ns = max(earliest_ns, self.window.first * self._knot_ns)
+        head = self.head
+        known = None if head is None else Prediction(head.t_ns, head.e_L, head.g_L)
+        equations = self._maker.make(flow, depth, self.memory, earliest_ns, known)
+        if len(equations.on_error.z) < self._o.min_flows:
             if flow.n_selected > 0:
                 self._count("fit.few_flows")
             self.lacking = _lack(flow, depth)
             return None
-        inv_depth = depth.inv_depth[at_depth]
-        self._depth_m = 1.0 / max(float(np.median(inv_depth)), 1e-3)
-        n = flow.n[at_flow]
-        where = ((flow.x[at_flow], flow.y[at_flow]), n, inv_depth, self._camera, self._R_CB, self._p_BC_B)
-        a_B, b_B = flow_equation.body_rows(*where)
-        R_LB, s_L, w_B = self.memory.at(t)
-        # Eq. 4: |x_n| - n^T B w = (n^T A / Z) v
-        speed = flow.speed[at_flow].astype(np.float64)
-        on_velocity = flow_equation.on_velocity(t, speed, a_B, b_B, w_B)
-        measured = Measured(
-            speed, flow.sigma[at_flow].astype(np.float64), on_velocity.z.copy(), depth.sigma[at_depth] / inv_depth
-        )
-        on_error = flow_equation.on_error(on_velocity, R_LB, s_L)
-        common = self._common(on_velocity, on_error, measured)
-        across_B, _ = flow_equation.body_rows(where[0], np.stack([-n[:, 1], n[:, 0]], axis=1), *where[2:])
-        across = flow_equation.on_error(replace(on_velocity, a=across_B), R_LB, s_L).a
-        return Equations(on_error if self._o.spline == "error" else on_velocity, on_error, measured, common, across)
-
-    @staticmethod
-    def _e(t_ns: I64, head: Head) -> F64:
-        """e (m, 3) at ``t_ns`` (m,), from the head on along the slope of gravity."""
-        return head.e_L - np.outer((t_ns - head.t_ns) * 1e-9, head.g_L)
+        self._depth_m = equations.depth_m
+        return equations
 
     def _fit(self, t_ns: int, equations: Equations) -> Fit | None:
         """The batch's own solution for e at ``t_ns``: gravity, which e holds, is taken from what is known of it.
@@ -322,13 +277,11 @@ class Estimator:
         The sigmas of the rows are set on the way.
         """
         on_error, measured = equations.on_error, equations.measured
-        dt = (on_error.t_ns - t_ns) * 1e-9
-        still = replace(on_error, z=on_error.z + (on_error.a @ self._gravity()) * dt)
-        predicted_e = np.zeros(3)
+        # from the prediction on, so that a direction that no flow sees stays there
+        common, predicted_e = np.zeros(3), np.zeros(3)
         if self.head is not None:
-            # from the prediction on, so that a direction that no flow sees stays there
-            predicted_e = self._e(np.array([t_ns]), self.head)[0]
-            still.z[:] -= equations.common @ self.head.common + on_error.a @ predicted_e
+            common, predicted_e = self.head.common, self.head.e_at(t_ns)
+        still = flow_equation.less_known(on_error, equations.common, common, -self._gravity(), predicted_e, t_ns)
         iterations, seed = self._o.ransac_iterations, self._o.seed + t_ns // 1000
         if self._o.weights == "fixed":
             still.sigma[:] = self._o.fixed_sigma_px_s
@@ -372,26 +325,16 @@ class Estimator:
 
     def _linearise(self, interval: Interval, t_j: int) -> None:
         """Eq. 14's inertial residual over [t_i, ``t_j``], in the frame B_i, its gyroscope noise by bins."""
-        t_i, interval.until = interval.t_i, t_j
+        interval.until = t_j
         shared = self._o.shared_gyro_noise
-        p = self._preintegrate(t_i, t_j, *self._biases(), gyro_noise=0.0 if shared else None)
-        R_LBi, N_i, M_i = self._frame(t_i)
-        _, N_j, M_j = self._frame(t_j)
+        p = self._preintegrate(interval.t_i, t_j, *self._biases(), gyro_noise=0.0 if shared else None)
+        R_LB, s_L, _ = self.memory.at(interval.times())
         head = self.head
         predicted = self.predict(t_j) if head is not None and t_j >= head.t_ns else None
         v_j = predicted[0] if predicted is not None else (np.zeros(3) if head is None else head.v_B)
-        interval.blocks, interval.r, interval.information = inertial_residual.linearise(
-            p, R_LBi, (N_i, M_i), (N_j, M_j), v_j
-        )
+        interval.linearise(p, R_LB, s_L, self._o.spline == "error", v_j)
         if head is not None and shared:
-            edges = interval.bin_edges()
-            middles = (edges[:-1] + edges[1:]) // 2
-            R_LB, s_L, _ = self.memory.at(middles)
-            # R_kj v_j - beta_kj
-            v_L = s_L + self._e(middles, head) - head.g_L * ((t_j - middles) * 1e-9)[:, None]
-            # a rate n for dt turns what follows: -R_ik [v_k]x dt n = -[v]x R_ik dt n, v in the frame B_i
-            turned = -hat(v_L @ R_LBi) @ (R_LBi.T @ R_LB) * (np.diff(edges) * 1e-9)[:, None, None]
-            interval.noise[:] = turned.transpose(1, 0, 2).reshape(3, -1)
+            interval.turn_by_noise(R_LB, s_L, head.e_at(t_j))
 
     def _add_flow(self, t_ns: int, equations: Equations, predicted: tuple[F64, F64] | None) -> None:
         fit = self._fit(t_ns, equations)
@@ -410,7 +353,8 @@ class Estimator:
             shared *= max(1.0, innovation / INNOVATION_GATE)
         if shared > self._o.shared_error:
             self._count("fit.inconsistent")
-        bins = flow_equation.compress(equations.on_spline, equations.common, fit, shared, self._slope())
+        on_spline = equations.on_error if self._o.spline == "error" else equations.on_velocity
+        bins = flow_equation.compress(on_spline, equations.common, fit, shared, self._slope())
         if len(weak_L):
             self._count("fit.degenerate")
             R_LB, _, _ = self._frame(t_ns)
@@ -431,10 +375,10 @@ class Estimator:
         """Give each bin to the interval that it begins in, or to the window where that is closed."""
         upto = [interval.flows.first for interval in self._open[1:]]
         for interval, stop in zip(self._open, [*upto, bins.first + bins.count], strict=True):
-            interval.flows.add(bins, stop, self._slope())
+            interval.add_flows(bins, stop, self._slope())
         for k in range(bins.first, min(self._open[0].flows.first, bins.first + bins.count)):
             alone = Interval(k * BIN_NS, (k + 1) * BIN_NS)
-            alone.flows.add(bins, k + 1, self._slope())
+            alone.add_flows(bins, k + 1, self._slope())
             self.window.add_interval(alone)
 
     def _add_standstill(self, t_ns: int) -> None:
@@ -454,23 +398,24 @@ class Estimator:
         self._note_usable(t_ns)
 
     def _still_sigma(self) -> float:
-        return self._standstill.sigma(self._depth_m / self._camera[0])
+        return self._standstill.sigma(self._depth_m / self._f)
 
     def _innovation(self, t_ns: int, rows: Rows, fit: Fit, predicted: tuple[F64, F64], weak_L: F64) -> float:
         """Squared Mahalanobis distance of the batch's own velocity from the predicted one, as of three dimensions.
 
         The directions ``weak_L`` (k, 3), which the batch does not determine, do not count.
         """
-        seen = degeneracy.complement(weak_L)
-        if not len(seen):
+        if len(weak_L) == 3:
             return 3.0
         R, s_L, _ = self.memory.at(np.array([t_ns]))
-        d = seen @ (s_L[0] + fit.e - R[0] @ predicted[0])
+        d = s_L[0] + fit.e - R[0] @ predicted[0]
         seen_s = max(int(rows.t_ns.max() - rows.t_ns.min()), BIN_NS) * 1e-9
         turned = flow_equation.turn_sensitivity(rows, fit) * self._imu.gyro_noise
-        own = fit.cov * self._o.shared_error + turned @ turned.T / seen_s
-        S = seen @ (own + R[0] @ predicted[1] @ R[0].T) @ seen.T
-        return float(d @ np.linalg.solve(S, d)) * 3.0 / len(seen)
+        S = fit.cov * self._o.shared_error + turned @ turned.T / seen_s + R[0] @ predicted[1] @ R[0].T
+        if len(weak_L):
+            seen = degeneracy.complement(weak_L)
+            d, S = seen @ d, seen @ S @ seen.T
+        return squared_distance(d, S) * 3.0 / len(d)
 
     def _keep_error_small(self) -> None:
         """Take from s_L what gravity has added to it, before the solution loses digits to it."""
@@ -494,18 +439,13 @@ class Estimator:
         F = self.window.selector(t_ns)
         R_LB, N, M = self._frame(t_ns)
         x = F @ solution.x
-        T = np.eye(12)
-        T[:3, :3] = M
-        cov = T @ solution.cov(F) @ T.T
+        cov = solution.cov(F)
+        cov[:3] = M @ cov[:3]
+        cov[:, :3] = cov[:, :3] @ M.T
         common = solution.x[self.window.common_columns(locate(t_ns, self._knot_ns)[0])]
         v_B = N + M @ x[:3]
         e_L = x[:3] if self._o.spline == "error" else R_LB @ v_B - self.memory.at(np.array([t_ns]))[1][0]
         self.head = Head(t_ns, v_B, x[3:6], x[6:9], x[9:12], R_LB, cov, common, e_L)
-
-
-def _small_turn(R: F64) -> F64:
-    """Rotation vector (3,) of a small rotation (3, 3), to the third order."""
-    return np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / 2.0
 
 
 def _lack(flow: FlowBatch, depth: DepthBatch) -> str:

@@ -10,13 +10,14 @@ rows in the frame of the estimated error e. Robust weights come from the batch's
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
 
 from velod.events.columns import readonly
-from velod.geometry.camera import motion_field_rows
+from velod.optimizer.small import median
 from velod.types import F32, F64, I64, U16
 
 BIN_NS = 5_000_000
@@ -105,9 +106,11 @@ def body_rows(
     ``camera`` is (f, cx, cy) of the rectified image. v_C = R_CB (v_B + w_B x p_BC_B): the lever arm adds p x a to b.
     """
     f, cx, cy = camera
-    nA, nB = motion_field_rows(xy[0].astype(np.float64), xy[1].astype(np.float64), f, cx, cy, n.astype(np.float64))
-    a_B, b_B = np.empty_like(nA), np.empty_like(nB)
-    _to_body(nA, nB, inv_depth.astype(np.float64), R_CB, p_BC_B, a_B, b_B)
+    a_B, b_B = np.empty((len(xy[0]), 3)), np.empty((len(xy[0]), 3))
+    _rows_in_body(
+        xy[0].astype(np.float64) - cx, xy[1].astype(np.float64) - cy, f, n.astype(np.float64),
+        inv_depth.astype(np.float64), R_CB, p_BC_B, a_B, b_B,
+    )  # fmt: skip
     return a_B, b_B
 
 
@@ -117,18 +120,9 @@ def sigmas(measured: Measured, residual: F64) -> F64:
     They are those of the flow that a velocity predicts, the measured one less ``residual`` (m,): a weight that
     follows the measured speed would believe slow flows more than fast ones, and bias the velocity.
     """
-    predicted_share = np.clip((measured.speed - residual) / measured.speed, *PREDICTED_SHARE)
-    from_fit = measured.sigma * predicted_share
-    from_depth = (measured.translational - residual) * measured.depth_share
-    return np.sqrt(from_fit**2 + MODEL_SIGMA_PX_S**2 + from_depth**2)
-
-
-def common(translational: F64, rotational: F64, rate: F64) -> F64:
-    """Rows (m, 3) of COMMON in z, from the predicted flow (its two parts, px/s) and its rate of change (px/s^2).
-
-    None of them may come from the noise that is in z: a product of both would look like a common error.
-    """
-    return np.column_stack([translational + rotational, -rate, translational])
+    out = np.empty_like(residual)
+    _sigmas(measured.speed, measured.sigma, measured.translational, measured.depth_share, residual, out)
+    return out
 
 
 def on_velocity(t_ns: I64, speed: F64, a_B: F64, b_B: F64, w_B: F64) -> Rows:
@@ -139,19 +133,11 @@ def on_velocity(t_ns: I64, speed: F64, a_B: F64, b_B: F64, w_B: F64) -> Rows:
     return Rows(t_ns, z, a_B, b_B, np.empty(m))
 
 
-def on_error(rows: Rows, R_LB: F64, s_L: F64) -> Rows:
-    """Rows on the error e of the integrated velocity, v_B = R_BL (s_L + e), from those on v_B."""
-    z, a_L = np.empty_like(rows.z), np.empty_like(rows.a)
-    _rotate(R_LB, rows.a, a_L)
-    _less_product(rows.z, a_L, s_L, z)
-    return Rows(rows.t_ns, z, a_L, rows.b, rows.sigma)
-
-
 def pairs(flow_index: U16, depth_index: U16) -> tuple[I64, I64]:
     """Positions in both of the values that two increasing columns share."""
     at_flow = np.empty(min(len(flow_index), len(depth_index)), np.int64)
     at_depth = np.empty_like(at_flow)
-    n = _pairs(readonly(flow_index, np.uint16), readonly(depth_index, np.uint16), at_flow, at_depth)
+    n = match(readonly(flow_index, np.uint16), readonly(depth_index, np.uint16), at_flow, at_depth)
     return at_flow[:n], at_depth[:n]
 
 
@@ -160,8 +146,8 @@ def solve(rows: Rows, iterations: int, seed: int, ridge: float = 0.0) -> Fit | N
 
     Returns None where the rows do not determine a velocity; with a ``ridge`` (RIDGE), e is 0 where they do not.
     """
-    e, H, g = np.zeros(3), np.empty((3, 3)), np.empty(3)
-    if len(rows.z) < 3 or not _ransac(rows.a, rows.z, rows.sigma, iterations, seed & 0x7FFFFFFF, ridge, e, H, g):
+    e = np.zeros(3)
+    if len(rows.z) < 3 or not _ransac(rows.a, rows.z, rows.sigma, iterations, seed & 0x7FFFFFFF, ridge, e):
         return None
     return _reweighted(rows, e, ridge)
 
@@ -179,18 +165,32 @@ def solve_weighted(rows: Rows, measured: Measured, iterations: int, seed: int, r
 
     The sigmas are set in ``rows``, in place.
     """
-    rows.sigma[:] = sigmas(measured, np.zeros_like(rows.z))
+    residual = np.zeros_like(rows.z)
+    what = (measured.speed, measured.sigma, measured.translational, measured.depth_share, residual, rows.sigma)
+    _sigmas(*what)
     first = solve(rows, iterations, seed, ridge)
     if first is None:
         return None
-    rows.sigma[:] = sigmas(measured, rows.z - rows.a @ first.e)
+    _residuals(rows.z, rows.a, first.e, residual)
+    _sigmas(*what)
     return _reweighted(rows, first.e, ridge)
+
+
+def less_known(rows: Rows, c: F64, common: F64, slope: F64, e: F64, t_ns: int) -> Rows:
+    """The rows on what differs from ``e`` (3,) at ``t_ns``, where ``common`` (3,) and the slope of e (3,) are known.
+
+    ``c`` (m, 3) are the rows of common errors. The sigma is that of ``rows``, the same array.
+    """
+    z = np.empty_like(rows.z)
+    _less_known(rows.t_ns, rows.z, rows.a, c, common, slope, e, t_ns, z)
+    return Rows(rows.t_ns, z, rows.a, rows.b, rows.sigma)
 
 
 def turn_sensitivity(rows: Rows, fit: Fit) -> F64:
     """d e / d n (3, 3) of a batch's own solution: what an error n of the angular velocity, rad/s, does to it."""
-    weighted = rows.a * (fit.weight / (rows.sigma * fit.scale) ** 2)[:, None]
-    d_e_d_n: F64 = fit.cov @ (weighted.T @ rows.b)
+    weighted = np.empty((3, 3))
+    _weighted_product(rows.a, rows.b, rows.sigma, fit.weight, weighted)
+    d_e_d_n: F64 = fit.cov @ weighted / fit.scale**2
     return d_e_d_n
 
 
@@ -210,7 +210,8 @@ def compress(rows: Rows, c: F64, fit: Fit, shared_error: float, slope: F64) -> B
 
 
 @njit(cache=True, nogil=True)
-def _pairs(left: U16, right: U16, at_left: I64, at_right: I64) -> int:
+def match(left: U16, right: U16, at_left: I64, at_right: I64) -> int:
+    """``pairs`` into at_left and at_right; returns how many."""
     i = j = n = 0
     while i < left.size and j < right.size:
         if left[i] < right[j]:
@@ -224,22 +225,62 @@ def _pairs(left: U16, right: U16, at_left: I64, at_right: I64) -> int:
 
 
 @njit(cache=True, nogil=True)
-def _to_body(nA: F64, nB: F64, inv_depth: F64, R_CB: F64, p: F64, a: F64, b: F64) -> None:
-    """a = nA R_CB / Z, b = nB R_CB + p x a, row by row."""
-    for k in range(inv_depth.size):
-        for i in range(3):
-            a[k, i] = inv_depth[k] * (nA[k, 0] * R_CB[0, i] + nA[k, 1] * R_CB[1, i] + nA[k, 2] * R_CB[2, i])
-            b[k, i] = nB[k, 0] * R_CB[0, i] + nB[k, 1] * R_CB[1, i] + nB[k, 2] * R_CB[2, i]
-        b[k, 0] += p[1] * a[k, 2] - p[2] * a[k, 1]
-        b[k, 1] += p[2] * a[k, 0] - p[0] * a[k, 2]
-        b[k, 2] += p[0] * a[k, 1] - p[1] * a[k, 0]
+def row_in_body(
+    u: float, v: float, f: float, nx: float, ny: float, rho: float, R_CB: F64, p: F64, k: int, a: F64, b: F64
+) -> None:
+    """Row k of a and b: n^T A rho R_CB and n^T B R_CB + p x a, at (u, v) px from the principal point (Eq. 4)."""
+    a0, a1, a2 = -f * nx, -f * ny, nx * u + ny * v
+    b0 = nx * u * v / f + ny * (f + v * v / f)
+    b1 = -nx * (f + u * u / f) - ny * u * v / f
+    b2 = nx * v - ny * u
+    for i in range(3):
+        a[k, i] = rho * (a0 * R_CB[0, i] + a1 * R_CB[1, i] + a2 * R_CB[2, i])
+        b[k, i] = b0 * R_CB[0, i] + b1 * R_CB[1, i] + b2 * R_CB[2, i]
+    b[k, 0] += p[1] * a[k, 2] - p[2] * a[k, 1]
+    b[k, 1] += p[2] * a[k, 0] - p[0] * a[k, 2]
+    b[k, 2] += p[0] * a[k, 1] - p[1] * a[k, 0]
 
 
 @njit(cache=True, nogil=True)
-def _rotate(R: F64, a: F64, out: F64) -> None:
-    for k in range(len(a)):
+def _rows_in_body(u: F64, v: F64, f: float, n: F64, inv_depth: F64, R_CB: F64, p: F64, a: F64, b: F64) -> None:
+    for k in range(u.size):
+        row_in_body(u[k], v[k], f, n[k, 0], n[k, 1], inv_depth[k], R_CB, p, k, a, b)
+
+
+@njit(cache=True, nogil=True)
+def _sigmas(speed: F64, sigma: F64, translational: F64, depth_share: F64, residual: F64, out: F64) -> None:
+    low, high = PREDICTED_SHARE
+    for k in range(speed.size):
+        share = min(max((speed[k] - residual[k]) / speed[k], low), high)
+        from_fit = sigma[k] * share
+        from_depth = (translational[k] - residual[k]) * depth_share[k]
+        out[k] = math.sqrt(from_fit * from_fit + MODEL_SIGMA_PX_S**2 + from_depth * from_depth)
+
+
+@njit(cache=True, nogil=True)
+def _residuals(z: F64, a: F64, e: F64, out: F64) -> None:
+    for k in range(z.size):
+        out[k] = z[k] - a[k, 0] * e[0] - a[k, 1] * e[1] - a[k, 2] * e[2]
+
+
+@njit(cache=True, nogil=True)
+def _less_known(t_ns: I64, z: F64, a: F64, c: F64, common: F64, slope: F64, e: F64, at_ns: int, out: F64) -> None:
+    for k in range(z.size):
+        dt = (t_ns[k] - at_ns) * 1e-9
+        out[k] = z[k]
         for i in range(3):
-            out[k, i] = R[k, i, 0] * a[k, 0] + R[k, i, 1] * a[k, 1] + R[k, i, 2] * a[k, 2]
+            out[k] -= c[k, i] * common[i] + a[k, i] * (e[i] + dt * slope[i])
+
+
+@njit(cache=True, nogil=True)
+def _weighted_product(a: F64, b: F64, sigma: F64, weight: F64, out: F64) -> None:
+    """out (3, 3) = a^T diag(weight / sigma^2) b."""
+    out[:, :] = 0.0
+    for k in range(sigma.size):
+        w = weight[k] / (sigma[k] * sigma[k])
+        for i in range(3):
+            for j in range(3):
+                out[i, j] += w * a[k, i] * b[k, j]
 
 
 @njit(cache=True, nogil=True)
@@ -285,8 +326,12 @@ def _compress(
         for i in range(9):
             wi = w * row[i]
             eta[at, i] += wi * z_mean
-            for j in range(9):
+            for j in range(i, 9):
                 L[at, i, j] += wi * row[j]
+    for at in range(len(L)):
+        for i in range(9):
+            for j in range(i):
+                L[at, i, j] = L[at, j, i]
 
 
 @njit(cache=True, nogil=True)
@@ -337,25 +382,21 @@ def _regularise(H, ridge):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _normal_equations(a, z, sigma, weight, ridge, H, g):  # type: ignore[no-untyped-def]
-    H[:, :] = 0.0
-    g[:] = 0.0
-    for k in range(len(z)):
-        w = weight[k] / (sigma[k] * sigma[k])
-        if w > 0.0:
-            for i in range(3):
-                wi = w * a[k, i]
-                g[i] += wi * z[k]
-                for j in range(3):
-                    H[i, j] += wi * a[k, j]
-    _regularise(H, ridge)
+def _scale(size: F64) -> float:
+    """Robust standard deviation of residuals whose absolute values these are, at least 1; ``size`` is reordered."""
+    small = 0
+    for k in range(size.size):
+        small += 1.4826 * size[k] <= 1.0
+    return 1.0 if 2 * small > size.size else max(1.0, 1.4826 * median(size))
 
 
 @njit(cache=True, nogil=True)
-def _ransac(a, z, sigma, iterations, seed, ridge, best, H, g):  # type: ignore[no-untyped-def]
+def _ransac(a, z, sigma, iterations, seed, ridge, best):  # type: ignore[no-untyped-def]
     """Minimal samples of Eq. 15; the truncated squared residual decides (MSAC, 3 sigma). False: none was regular."""
     m = len(z)
-    x = np.empty(3)
+    x, H, g, per_sigma = np.empty(3), np.empty((3, 3)), np.empty(3), np.empty(m)
+    for k in range(m):
+        per_sigma[k] = 1.0 / sigma[k]
     best_cost = np.inf
     state = np.uint64(seed) * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
     for _ in range(iterations):
@@ -371,9 +412,9 @@ def _ransac(a, z, sigma, iterations, seed, ridge, best, H, g):  # type: ignore[n
         _regularise(H, ridge)
         if not _solve3(H, g, x):
             continue
-        cost = 0.0
+        cost, x0, x1, x2 = 0.0, x[0], x[1], x[2]
         for k in range(m):
-            r = (z[k] - a[k, 0] * x[0] - a[k, 1] * x[1] - a[k, 2] * x[2]) / sigma[k]
+            r = (z[k] - a[k, 0] * x0 - a[k, 1] * x1 - a[k, 2] * x2) * per_sigma[k]
             cost += min(r * r, 9.0)
             if cost >= best_cost:
                 break
@@ -387,16 +428,37 @@ def _ransac(a, z, sigma, iterations, seed, ridge, best, H, g):  # type: ignore[n
 def _reweight(a, z, sigma, ridge, weight, e, cov, stats):  # type: ignore[no-untyped-def]
     """Five rounds of Tukey's weights from ``e`` (3,) on, in place; False where the rows do not determine it."""
     m = len(z)
-    H, g, r = np.empty((3, 3)), np.empty(3), np.empty(m)
+    H, g, r, size, per_sigma = np.empty((3, 3)), np.empty(3), np.empty(m), np.empty(m), np.empty(m)
+    for k in range(m):
+        per_sigma[k] = 1.0 / sigma[k]
     scale = 1.0
     for _ in range(5):
+        e0, e1, e2 = e[0], e[1], e[2]
         for k in range(m):
-            r[k] = (z[k] - a[k, 0] * e[0] - a[k, 1] * e[1] - a[k, 2] * e[2]) / sigma[k]
-        scale = max(1.0, 1.4826 * np.median(np.abs(r)))
+            r[k] = (z[k] - a[k, 0] * e0 - a[k, 1] * e1 - a[k, 2] * e2) * per_sigma[k]
+            size[k] = abs(r[k])
+        scale = _scale(size)
+        g0 = g1 = g2 = h00 = h01 = h02 = h11 = h12 = h22 = 0.0
         for k in range(m):
             u = r[k] / (4.685 * scale)  # Tukey's biweight, 95 % efficient
             weight[k] = (1.0 - u * u) ** 2 if abs(u) < 1.0 else 0.0
-        _normal_equations(a, z, sigma, weight, ridge, H, g)
+            w = weight[k] * per_sigma[k] * per_sigma[k]
+            a0, a1, a2 = a[k, 0], a[k, 1], a[k, 2]
+            w0, w1, w2 = w * a0, w * a1, w * a2
+            g0 += w0 * z[k]
+            g1 += w1 * z[k]
+            g2 += w2 * z[k]
+            h00 += w0 * a0
+            h01 += w0 * a1
+            h02 += w0 * a2
+            h11 += w1 * a1
+            h12 += w1 * a2
+            h22 += w2 * a2
+        g[0], g[1], g[2] = g0, g1, g2
+        H[0, 0], H[0, 1], H[0, 2] = h00, h01, h02
+        H[1, 0], H[1, 1], H[1, 2] = h01, h11, h12
+        H[2, 0], H[2, 1], H[2, 2] = h02, h12, h22
+        _regularise(H, ridge)
         if not _solve3(H, g, e):
             return False
     column, unit = np.empty(3), np.zeros(3)

@@ -86,11 +86,15 @@ class InertialMemory:
         """R_LB (m, 3, 3), s_L (m, 3) and the raw gyroscope (m, 3) at times within the integrated span."""
         m = len(t_ns)
         R, s, w = np.empty((m, 3, 3)), np.empty((m, 3)), np.empty((m, 3))
+        self.write_at(t_ns, R, s, w)
+        return R, s, w
+
+    def write_at(self, t_ns: I64, R: F64, s: F64, w: F64) -> None:
+        """``at`` into the arrays R (m, 3, 3), s (m, 3) and w (m, 3)."""
         n = self._n_integrated
         _nominal_at(
             self._t[:n], self._accel[:n], self._gyro[:n], self._bias[:n], self._R[:n], self._s[:n], t_ns, R, s, w
         )
-        return R, s, w
 
     def rate_at(self, t_ns: int) -> tuple[F64, float]:
         """The gyroscope (3,) at ``t_ns`` between two samples, and its variance over its density's square, 1/s."""
@@ -167,9 +171,14 @@ def _nominal_at(t_ns, accel, gyro, bias, R_at, s_at, t_query, R_out, s_out, w_ou
     # Scratch instead of views of the rows: a view costs more than the arithmetic.
     phi, E, M, R, s = np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
     a0, w0, a1, w1, b = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(6)
+    # the samples are found from those of the query before, which are near in general
+    last = len(t_ns) - 2
+    k = min(max(np.searchsorted(t_ns, t_query[0], side="right") - 1, 0), last) if len(t_query) else 0
     for m in range(len(t_query)):
-        k = np.searchsorted(t_ns, t_query[m], side="right") - 1
-        k = min(max(k, 0), len(t_ns) - 2)
+        while k < last and t_ns[k + 1] <= t_query[m]:
+            k += 1
+        while k > 0 and t_ns[k] > t_query[m]:
+            k -= 1
         share = (t_query[m] - t_ns[k]) / (t_ns[k + 1] - t_ns[k])
         for i in range(3):
             a0[i], w0[i], s[i] = accel[k, i], gyro[k, i], s_at[k, i]

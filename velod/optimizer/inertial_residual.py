@@ -31,19 +31,39 @@ def carried_jacobian(p: Preintegration, v_B: F64, R_LB: F64) -> F64:
 
 
 def linearise(
-    p: Preintegration, R_LBi: F64, from_i: tuple[F64, F64], from_j: tuple[F64, F64], v_j: F64
-) -> tuple[F64, F64, F64]:
-    """Blocks (3, 15), r (3,) and information (3, 3) of the residual blocks x - r, in the frame B_i.
+    p: Preintegration, R_LB: F64, s_L: F64, on_error: bool, v_j: F64, blocks: F64, r: F64, information: F64
+) -> None:
+    """The residual blocks x - r, in the frame B_i: into blocks (3, 15), r (3,) and information (3, 3).
 
-    x = [spline(t_i), b_a, b_w, g_L, spline(t_j)]; ``from_i`` and ``from_j`` are (N, M) of v_B = N + M spline, and
-    ``v_j`` is the velocity at t_j at which the residual is linearised.
+    x = [spline(t_i), b_a, b_w, g_L, spline(t_j)]; ``R_LB`` and ``s_L`` are at t_i and t_j (further ones are of no
+    interest), ``on_error``: the spline is e of v_B = R_BL (s_L + e), else v_B; ``v_j`` is the velocity at t_j at
+    which the residual is linearised.
     """
-    blocks, r, information = np.empty((3, 15)), np.empty(3), np.empty((3, 3))
     _linearise(
         p.R_gamma, p.beta, p.d_theta_d_bw, p.d_beta_d_ba, p.d_beta_d_bw, p.cov, p.dt, p.b_a, p.b_w,
-        R_LBi, from_i[0], from_i[1], from_j[0], from_j[1], v_j, blocks, r, information,
+        R_LB, s_L, on_error, v_j, blocks, r, information,
     )  # fmt: skip
-    return blocks, r, information
+
+
+@njit(cache=True, nogil=True)
+def turn_by_noise(bin_s: F64, R_LB: F64, s_L: F64, e_L: F64, out: F64) -> None:
+    """What the gyroscope's noise of each bin does to the residual, out (3, 3 bins), in the frame B_i.
+
+    ``R_LB`` and ``s_L`` are those at t_i, t_j and in the middle of the bins, which last ``bin_s``; ``e_L`` at t_j.
+    """
+    v, turn, turned = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
+    for k in range(bin_s.size):
+        # a rate n for dt turns what follows, R_kj v_j - beta_kj: -R_ik [v_k]x dt n = -[v]x R_ik dt n, v in B_i
+        multiply(R_LB[0].T, R_LB[2 + k], turn)
+        for i in range(3):
+            v[i] = 0.0
+            for r in range(3):
+                v[i] -= R_LB[0, r, i] * (s_L[2 + k, r] + e_L[r]) * bin_s[k]
+        for i in range(3):
+            turned[0, i] = v[1] * turn[2, i] - v[2] * turn[1, i]
+            turned[1, i] = v[2] * turn[0, i] - v[0] * turn[2, i]
+            turned[2, i] = v[0] * turn[1, i] - v[1] * turn[0, i]
+        out[:, 3 * k : 3 * k + 3] = turned
 
 
 @njit(cache=True, nogil=True)
@@ -112,24 +132,26 @@ def _linearise(
     dt: float,
     b_a: F64,
     b_w: F64,
-    R_LBi: F64,
-    N_i: F64,
-    M_i: F64,
-    N_j: F64,
-    M_j: F64,
+    R_LB: F64,
+    s_L: F64,
+    on_error: bool,
     v_j: F64,
     blocks: F64,
     r: F64,
     information: F64,
 ) -> None:
     G, turned, block, cov = np.zeros((3, 6)), np.empty((3, 3)), np.empty((3, 3)), np.zeros((3, 3))
+    N_i, M_i, N_j, M_j = np.zeros(3), np.eye(3), np.zeros(3), np.eye(3)
+    if on_error:
+        _affine(R_LB[0], s_L[0], N_i, M_i)
+        _affine(R_LB[1], s_L[1], N_j, M_j)
     _multiply_hat(R_gamma, v_j, turned)
     # Eq. 14: beta(b) - R(gamma(b)) v_j - g_B dt + v_i = 0
     blocks[:, :3] = M_i
     blocks[:, 3:6] = d_beta_d_ba
     multiply(turned, d_theta_d_bw, block)
     blocks[:, 6:9] = d_beta_d_bw + block
-    blocks[:, 9:12] = -dt * R_LBi.T
+    blocks[:, 9:12] = -dt * R_LB[0].T
     multiply(R_gamma, M_j, block)
     blocks[:, 12:] = -block
     for i in range(3):
@@ -142,6 +164,16 @@ def _linearise(
         cov[i, i] = IMU_MODEL_SIGMA**2
     add_sandwich(G, cov_imu, cov)
     _invert(cov, information)
+
+
+@njit(cache=True, nogil=True)
+def _affine(R_LB: F64, s_L: F64, N: F64, M: F64) -> None:
+    """v_B = N + M e, of v_B = R_BL (s_L + e)."""
+    for i in range(3):
+        N[i] = 0.0
+        for k in range(3):
+            M[i, k] = R_LB[k, i]
+            N[i] += R_LB[k, i] * s_L[k]
 
 
 @njit(cache=True, nogil=True)

@@ -12,7 +12,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numba import njit
 
+from velod.optimizer import inertial_residual
 from velod.optimizer.flow_equation import BIN_NS, Bins
+from velod.optimizer.preintegration import Preintegration
 from velod.optimizer.spline import fill_basis
 from velod.types import F64, I64
 
@@ -41,6 +43,10 @@ class Interval:
     r: F64 = field(default_factory=lambda: np.zeros(3))
     information: F64 = field(default_factory=lambda: np.zeros((3, 3)))
     noise: F64 = field(init=False)  # (3, 3 bins)
+    bin_s: F64 = field(init=False)  # (bins,) what the IMU says of each, s
+    _A: F64 = field(init=False)  # normal equations of the local states, then of the noises, which are eliminated
+    _g: F64 = field(init=False)
+    _folded: bool = field(init=False, default=False)
     flows: Bins = field(init=False)
 
     def __post_init__(self) -> None:
@@ -48,27 +54,64 @@ class Interval:
         first = self.t_i // BIN_NS
         self.flows = Bins(first, -(-self.t_j // BIN_NS) - first)
         self.noise = np.zeros((3, 3 * self.flows.count))
+        self.bin_s = np.zeros(self.flows.count)
+        size = _LOCAL + self.noise.shape[1]
+        self._A, self._g = np.empty((size, size)), np.empty(size)
 
-    def bin_edges(self) -> I64:
-        """Edges (bins + 1,) of the bins, cut to what the IMU says."""
-        edges = (self.flows.first + np.arange(self.flows.count + 1)) * BIN_NS
-        return np.clip(edges, self.t_i, self.until)
+    def linearise(self, p: Preintegration, R_LB: F64, s_L: F64, on_error: bool, v_j: F64) -> None:
+        """Take what the IMU says up to ``until``, of which ``p`` is the preintegration.
+
+        ``R_LB`` (2 + bins, 3, 3) and ``s_L`` (2 + bins, 3) are those at ``times``; ``on_error``: whether the spline
+        is that of the error e; ``v_j`` (3,): the velocity at ``until`` at which the residual is linearised.
+        """
+        inertial_residual.linearise(p, R_LB, s_L, on_error, v_j, self.blocks, self.r, self.information)
+        self._folded = False
+
+    def times(self) -> I64:
+        """``t_i``, ``until``, and the middle of every bin, cut to what the IMU says; notes ``bin_s`` on the way."""
+        out = np.empty(2 + self.flows.count, np.int64)
+        _bin_times(self.t_i, self.until, self.flows.first, self.bin_s, out)
+        return out
+
+    def turn_by_noise(self, R_LB: F64, s_L: F64, e_L: F64) -> None:
+        """Take what the gyroscope's noise does; R_LB and s_L as in ``linearise``, ``e_L`` (3,) at ``until``."""
+        inertial_residual.turn_by_noise(self.bin_s, R_LB, s_L, e_L, self.noise)
+        self._folded = False
+
+    def add_flows(self, bins: Bins, stop: int, slope: F64) -> None:
+        """``Bins.add``."""
+        self.flows.add(bins, stop, slope)
+        self._folded = False
 
     def shift(self, offset: F64) -> None:
         """Count the spline from another origin: its values + offset (3,)."""
         self.r += (self.blocks[:, :3] + self.blocks[:, 12:]) @ offset
         self.flows.eta += self.flows.L[:, :, :3] @ offset
+        self._folded = False
 
     def fold(self, noise_information: float, knot_ns: int, first: int, H: F64, h: F64, end: I64) -> None:
         """Add what IMU and flows say to the normal equations of a window whose first segment is ``first``.
 
-        ``noise_information``: of the gyroscope's noise in one bin, (rad/s)^-2.
+        ``noise_information``: of the gyroscope's noise in one bin, (rad/s)^-2. Noise and knots are the same in every
+        call: an interval that has got nothing new since the last one has its sum still.
         """
-        _fold(
-            self.t_i, self.until, self.blocks, self.r, self.information, self.noise,
-            self.flows.first, self.flows.total, self.flows.L, self.flows.eta,
-            noise_information, knot_ns, first, H, h, end,
-        )  # fmt: skip
+        if not self._folded:
+            _fold(
+                self.t_i, self.until, self.blocks, self.r, self.information, self.noise,
+                self.flows.first, self.flows.total, self.flows.L, self.flows.eta,
+                noise_information, knot_ns, self._A, self._g,
+            )  # fmt: skip
+            self._folded = True
+        _spread(self._A, self._g, self.t_i // knot_ns - first, H, h, end)
+
+
+@njit(cache=True, nogil=True)
+def _bin_times(t_i: int, until: int, first_bin: int, bin_s: F64, times: I64) -> None:
+    times[0], times[1] = t_i, until
+    for k in range(bin_s.size):
+        start = min(max((first_bin + k) * BIN_NS, t_i), until)
+        stop = min(max((first_bin + k + 1) * BIN_NS, t_i), until)
+        bin_s[k], times[2 + k] = (stop - start) * 1e-9, (start + stop) // 2
 
 
 @njit(cache=True, nogil=True)
@@ -85,13 +128,11 @@ def _fold(
     eta: F64,
     noise_information: float,
     knot_ns: int,
-    first: int,
-    H: F64,
-    h: F64,
-    end: I64,
+    A: F64,
+    g: F64,
 ) -> None:
-    size = _LOCAL + noise.shape[1]
-    A, g = np.zeros((size, size)), np.zeros(size)
+    A[:, :] = 0.0
+    g[:] = 0.0
     segment = t_i // knot_ns
     _add_imu(t_i, until, segment, knot_ns, blocks, r, information, noise, A, g)
     for k in range(len(total)):
@@ -102,7 +143,6 @@ def _fold(
             t = (first_bin + k) * BIN_NS + int(total[k, 1] / total[k, 0])
             _add_flows(t, segment, knot_ns, n, L[k], eta[k], A, g)
     _eliminate_tail(A, g, _LOCAL)
-    _spread(A, g, segment - first, H, h, end)
 
 
 @njit(cache=True, nogil=True)
@@ -149,14 +189,19 @@ def _add_flows(t, segment, knot_ns, n, L, eta, A, g):  # type: ignore[no-untyped
 @njit(cache=True, nogil=True)
 def _eliminate_tail(A, g, kept):  # type: ignore[no-untyped-def]
     """Schur complement of the states from ``kept`` on; A is its upper triangle."""
+    column = np.empty(len(g))
     for p in range(len(g) - 1, kept - 1, -1):
+        # contiguous, as the inner loop goes along it
         for i in range(p):
-            if A[i, p] == 0.0:
+            column[i] = A[i, p]
+        for i in range(p):
+            if column[i] == 0.0:
                 continue
-            f = A[i, p] / A[p, p]
+            f = column[i] / A[p, p]
             g[i] -= f * g[p]
+            row = A[i]
             for j in range(i, p):
-                A[i, j] -= f * A[j, p]
+                row[j] -= f * column[j]
 
 
 @njit(cache=True, nogil=True)

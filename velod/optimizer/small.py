@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+
+import numpy as np
 from numba import njit
 
 from velod.types import F64
@@ -29,3 +32,54 @@ def add_sandwich(J: F64, P: F64, out: F64) -> None:
                 s += J[i, m] * P[m, k]
             for j in range(rows):
                 out[i, j] += s * J[j, k]
+
+
+@njit(cache=True, nogil=True)
+def median(values: F64) -> float:
+    """Of values (n,), n > 0, which are reordered on the way (quickselect)."""
+    n = values.size
+    low, high, middle = 0, n - 1, n // 2
+    while low < high:
+        pivot = values[(low + high) // 2]
+        i, j = low, high
+        while i <= j:
+            while values[i] < pivot:
+                i += 1
+            while values[j] > pivot:
+                j -= 1
+            if i <= j:
+                values[i], values[j] = values[j], values[i]
+                i += 1
+                j -= 1
+        if middle <= j:
+            high = j
+        elif middle >= i:
+            low = i
+        else:
+            break
+    upper = values[middle]
+    if n % 2:
+        return float(upper)
+    lower = values[0]
+    for k in range(middle):
+        lower = max(lower, values[k])
+    return 0.5 * float(lower + upper)
+
+
+@njit(cache=True, nogil=True)
+def squared_distance(d: F64, S: F64) -> float:
+    """d^T S^-1 d for d (n,) and symmetric, positive definite S (n, n), by Cholesky's factor."""
+    n = d.size
+    root, y, total = np.empty((n, n)), np.empty(n), 0.0
+    for i in range(n):
+        for j in range(i + 1):
+            r = S[i, j]
+            for k in range(j):
+                r -= root[i, k] * root[j, k]
+            root[i, j] = math.sqrt(r) if i == j else r / root[j, j]
+        y[i] = d[i]
+        for k in range(i):
+            y[i] -= root[i, k] * y[k]
+        y[i] /= root[i, i]
+        total += y[i] * y[i]
+    return total

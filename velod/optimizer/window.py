@@ -5,6 +5,9 @@ b_a and b_w, g_L, the specific force of gravity in the frame L at the segment (E
 biases), and what all flows of the moment have wrong in common (``flow_equation.COMMON``). All factors are linear in
 the states at the linearisation of their first sight, so that they add up in one information matrix, and leaving the
 window (marginalisation) is a Schur complement that loses nothing.
+
+States older than all factors to come are eliminated once, not with every solution: what is left, the front, is small.
+A factor that comes late renews it.
 """
 
 from __future__ import annotations
@@ -19,7 +22,7 @@ from velod.config import ImuSettings
 from velod.geometry.so3 import hat
 from velod.optimizer.flow_equation import BIN_NS
 from velod.optimizer.interval import BLOCK, HEAD, Interval
-from velod.optimizer.spline import basis, locate
+from velod.optimizer.spline import fill_basis, locate
 from velod.types import F64, I64
 
 UNKNOWN_VELOCITY = 100.0
@@ -83,6 +86,13 @@ class Window:
         self._h = np.zeros(size)
         self._end = np.zeros(size, np.int64)  # no state at or after it has met that of the row in a factor
         self._U, self._last = np.zeros((size, size)), np.empty(size, np.int64)  # of the last solve
+        self._x = np.empty(size)
+        # What is left of H and h from column ``_front`` on once the states before are eliminated, which the first
+        # rows of U, last and _forward hold; -1: to be renewed.
+        self._front = -1
+        self._front_H, self._front_h = np.zeros((size, size)), np.zeros(size)
+        self._front_end = np.zeros(size, np.int64)
+        self._forward = np.zeros(size)
         self.first = 0
         self.last = -1
 
@@ -110,6 +120,7 @@ class Window:
         self._H[:] = 0.0
         self._h[:] = 0.0
         self._end[:] = np.arange(1, len(self._end) + 1)
+        self._front = -1
         at = np.arange(HEAD)
         self._H[at, at] = 1.0 / UNKNOWN_VELOCITY**2
         b = self.bias_columns(self.last)
@@ -151,9 +162,7 @@ class Window:
 
     def control_columns(self, segment: int) -> list[int]:
         """First column of each of the four control points of a segment."""
-        k = segment - self.first
-        newest = [HEAD + BLOCK * (k + i - 3) if k + i >= 3 else 3 * (k + i) for i in range(4)]
-        return newest
+        return [_control_column(segment - self.first + i) for i in range(4)]
 
     def bias_columns(self, segment: int) -> np.ndarray:
         """Columns of [b_a, b_w] of a segment, (6,)."""
@@ -171,29 +180,30 @@ class Window:
         """F (3, n) with F x = the spline at ``t_ns`` (Eq. 7)."""
         segment, u = locate(t_ns, self._knot_ns)
         F = np.zeros((3, self.size))
-        self._place_spline(F, segment, basis(u))
+        _place_spline(F, segment - self.first, u)
         return F
 
     def selector(self, t_ns: int) -> F64:
         """F (12, n) with F x = [spline at t_ns, b_a, b_w, g_L of its segment]."""
         segment, u = locate(t_ns, self._knot_ns)
         F = np.zeros((12, self.size))
-        self._place_spline(F, segment, basis(u))
+        _place_spline(F, segment - self.first, u)
         own = HEAD + BLOCK * (segment - self.first)
         F[_SELECTED, own + _SELECTED] = 1.0
         return F
 
-    def _place_spline(self, F: F64, segment: int, weights: F64) -> None:
-        for column, weight in zip(self.control_columns(segment), weights.tolist(), strict=True):
-            F[0, column] = F[1, column + 1] = F[2, column + 2] = weight
-
     def add(self, J: F64, r: F64, information: F64) -> None:
         """A factor (J x - r)^T information (J x - r)."""
         _add_factor(self._H, self._h, self._end, J, r, information)
+        self._front = -1
 
     def add_interval(self, interval: Interval) -> None:
         """IMU and flows of a complete interval."""
-        interval.fold(self._noise_information, self._knot_ns, self.first, self._H, self._h, self._end)
+        self._fold(interval, self._H, self._h, self._end)
+        if self._oldest_column(interval) >= self._front:
+            self._fold(interval, self._front_H, self._front_h, self._front_end)
+        else:
+            self._front = -1
 
     def shift(self, offset: F64) -> None:
         """Count the spline from another origin: every control point + offset (3,); the information is the same."""
@@ -203,6 +213,7 @@ class Window:
             for column in self.control_columns(segment):
                 change[column : column + 3] = offset
         self._h[:n] += self._H[:n, :n] @ change
+        self._front = -1
 
     def solve(self, extra: Sequence[Interval], g_prior: F64 | None, g_sigma: float) -> Solution:
         """The optimum with further intervals that are not kept.
@@ -211,12 +222,16 @@ class Window:
         factor along it on the newest segment, weakened by what a wrong direction would do to the linearisation.
         Raises numpy.linalg.LinAlgError where the information does not determine the states.
         """
-        n = self.size
-        U, last, x = self._U, self._last, self._h[:n].copy()
-        U[:n, :n] = self._H[:n, :n]
-        last[:n] = self._end[:n]
+        front = self._oldest_column(extra[0]) if extra else 0
+        if front != self._front:
+            self._renew_front(front)
+        n, x, rest = self.size, self._x[: self.size], slice(front, self.size)
+        U, last = self._U, self._last
+        _copy_envelope(self._front_H, self._front_end, front, n, U)
+        last[rest] = self._front_end[rest]
+        x[:front], x[rest] = self._forward[:front], self._front_h[rest]
         for interval in extra:
-            interval.fold(self._noise_information, self._knot_ns, self.first, U, x, last)
+            self._fold(interval, U, x, last)
         if g_prior is not None:
             direction = g_prior / np.linalg.norm(g_prior)
             sigma = NORM_SIGMA + self._imu.gravity * g_sigma**2
@@ -224,10 +239,35 @@ class Window:
             g = slice(at, at + 3)
             U[g, g] += np.outer(direction, direction) / sigma**2
             x[g] += direction * self._imu.gravity / sigma**2
-        if not _factorise(U, last, n):
-            raise np.linalg.LinAlgError("the information of the window is not positive definite")
-        _substitute(U, last, x)
+        self._factorise(front, n)
+        _forward(U, last, x, front, n)
+        _backward(U, last, x)
         return Solution(x, U, last)
+
+    def _fold(self, interval: Interval, H: F64, h: F64, end: I64) -> None:
+        interval.fold(self._noise_information, self._knot_ns, self.first, H, h, end)
+
+    def _oldest_column(self, interval: Interval) -> int:
+        """The first column that an interval may speak of."""
+        return _control_column(locate(interval.t_i, self._knot_ns)[0] - self.first)
+
+    def _renew_front(self, front: int) -> None:
+        """Eliminate the states before column ``front``."""
+        n, rest = self.size, slice(front, self.size)
+        U, last, y = self._U, self._last, self._forward
+        _copy_envelope(self._H, self._end, 0, n, U)
+        last[:n], y[:n] = self._end[:n], self._h[:n]
+        self._factorise(0, front)
+        _forward(U, last, y, 0, front)
+        reach = int(last[:front].max(initial=front))
+        np.maximum(last[front:reach], reach, out=last[front:reach])
+        self._front_end[rest], self._front_h[rest] = last[rest], y[rest]
+        _copy_envelope(U, last, front, n, self._front_H)
+        self._front = front
+
+    def _factorise(self, start: int, stop: int) -> None:
+        if not _factorise(self._U, self._last, start, stop):
+            raise np.linalg.LinAlgError("the information of the window is not positive definite")
 
     def _carry_common(self, dt: float) -> None:
         """The common errors of the newest segment are those of the one before, ``dt`` s earlier, less and less."""
@@ -263,6 +303,34 @@ class Window:
         H[m:], H[:, m:], h[m:] = 0.0, 0.0, 0.0
         end[m:] = np.arange(m + 1, len(end) + 1)
         self.first += 1
+        self._front = -1
+
+
+@njit(cache=True, nogil=True)
+def _control_column(k: int) -> int:
+    """Column of the control point ``k`` after the oldest of the window."""
+    return HEAD + BLOCK * (k - 3) if k >= 3 else 3 * k
+
+
+@njit(cache=True, nogil=True)
+def _place_spline(F: F64, k: int, u: float) -> None:
+    """Eq. 7 at ``u`` within the ``k``-th segment into the first three rows of F."""
+    weights = np.empty(4)
+    fill_basis(u, weights)
+    for a in range(4):
+        column = _control_column(k + a)
+        for i in range(3):
+            F[i, column + i] = weights[a]
+
+
+@njit(cache=True, nogil=True)
+def _copy_envelope(H: F64, end: I64, start: int, n: int, out: F64) -> None:
+    """The upper triangle of H from row ``start`` on; beyond the envelope zeros, up to where it may fill up."""
+    for i in range(start, n):
+        for j in range(i, end[i]):
+            out[i, j] = H[i, j]
+        for j in range(end[i], n):
+            out[i, j] = 0.0
 
 
 @njit(cache=True, nogil=True)
@@ -312,14 +380,15 @@ def _eliminate(H: F64, h: F64, gone: I64, reach: int) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _factorise(U: F64, last: I64, n: int) -> bool:
-    """H = U^T U in place, for the upper triangle of H (n, n) in ``U``; ``last`` bounds its rows. False: not definite.
+def _factorise(U: F64, last: I64, start: int, stop: int) -> bool:
+    """H = U^T U in place, rows ``start`` to ``stop``, for the upper triangle of H in ``U``. False: not definite.
 
-    Three rows at a time: the envelope of a row is that of the block (n is a multiple of 3), and fills up with that of
-    the rows before, so ``last`` is raised accordingly.
+    Rows before ``start`` are done; those from ``stop`` on become the Schur complement. ``last`` bounds the rows.
+    Three rows at a time: the envelope of a row is that of the block (``start`` and ``stop`` are multiples of 3), and
+    fills up with that of the rows before, so ``last`` is raised accordingly.
     """
     reach = 0
-    for k in range(0, n, 3):
+    for k in range(start, stop, 3):
         for i in range(k, k + 3):
             reach = max(reach, last[i])
         last[k : k + 3] = reach
@@ -343,14 +412,18 @@ def _factorise(U: F64, last: I64, n: int) -> bool:
 
 
 @njit(cache=True, nogil=True)
-def _substitute(U: F64, last: I64, x: F64) -> None:
-    """x <- (U^T U)^-1 x, in place."""
-    n = len(x)
-    for i in range(n):
+def _forward(U: F64, last: I64, x: F64, start: int, stop: int) -> None:
+    """x <- U^-T x in place, rows ``start`` to ``stop`` of it; those after become the right side of what is left."""
+    for i in range(start, stop):
         x[i] /= U[i, i]
         for j in range(i + 1, last[i]):
             x[j] -= U[i, j] * x[i]
-    for i in range(n - 1, -1, -1):
+
+
+@njit(cache=True, nogil=True)
+def _backward(U: F64, last: I64, x: F64) -> None:
+    """x <- U^-1 x, in place."""
+    for i in range(len(x) - 1, -1, -1):
         s = x[i]
         for j in range(i + 1, last[i]):
             s -= U[i, j] * x[j]
