@@ -225,7 +225,7 @@ def _candidates(surface: I64, taken: I64, marks: U64, cell_px: int, columns: int
     for i in word[:n]:
         for j in range(8):
             found[m] = 8 * i + j
-            m += np.int64(marks[i] >> np.uint64(8 * j) & np.uint64(1))
+            m += int(marks[i] >> np.uint64(8 * j) & np.uint64(1))
     row_cell = np.arange(2 * h) % h // cell_px * columns
     column_cell = np.arange(w) // cell_px
     n = 0

@@ -190,7 +190,7 @@ def _are_good(x: U16, y: U16, t_ns: I64, p: U8, width: int, height: int, not_bef
         highest_p = max(highest_p, p[i])
     for i in range(1, t_ns.size):
         backwards |= t_ns[i] < t_ns[i - 1]
-    return last_x < width and last_y < height and highest_p < 2 and not backwards and t_ns[0] >= not_before_ns
+    return bool(last_x < width and last_y < height and highest_p < 2 and not backwards and t_ns[0] >= not_before_ns)
 
 
 @njit(cache=True, nogil=True)
