@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from numba import njit
 
 from velod.types import F32, NS_PER_S, U16
 
@@ -35,7 +36,21 @@ class TimeSurface:
 
     def render(self, ages: U16, table: F32) -> F32:
         """(height, width) float32 in 0..1 of ages (h, w) on the sensor grid, with ``table`` from ``decay_table``."""
-        surface = np.take(table, ages)
-        if self._maps is not None:
-            return np.asarray(cv2.remap(surface, *self._maps, cv2.INTER_LINEAR))
-        return np.ascontiguousarray(surface[:, ::-1]) if self._mirrored else surface
+        surface = np.empty(ages.shape, np.float32)
+        # The maps mirror by themselves.
+        _decay(ages, table, self._mirrored and self._maps is None, surface)
+        return surface if self._maps is None else np.asarray(cv2.remap(surface, *self._maps, cv2.INTER_LINEAR))
+
+
+@njit(cache=True, nogil=True)
+def _decay(ages: U16, table: F32, mirrored: bool, out: F32) -> None:
+    """out = table[ages], each row backwards if ``mirrored``."""
+    h, w = ages.shape
+    for r in range(h):
+        row, decayed = ages[r], out[r]
+        if mirrored:
+            for c in range(w):
+                decayed[w - 1 - c] = table[row[c]]
+        else:
+            for c in range(w):
+                decayed[c] = table[row[c]]

@@ -15,6 +15,14 @@ from velod.types import F32, F64, I64
 # A block whose variance is below this is flat: nothing to match.
 _FLAT = 1e-6
 
+NONE = np.float32(-2.0)
+"""A score that is none, below all that are."""
+RIVAL_PX = 2
+"""Scores this close to the best one belong to it."""
+
+USUAL_HALF = 8
+"""Of a block of 17 px."""
+
 CHUNK = 56
 """Disparities that are correlated at once: a constant, and of 8, so that the compiler leaves no remainder loop."""
 
@@ -159,11 +167,32 @@ def _normalise(scores: F32, total: F64, squares: F64, xm: int, y: int, half: int
 
 @njit(cache=True, nogil=True, fastmath={"nnan", "nsz"})
 def _largest(scores: F32) -> np.float32:
-    """The largest score, -1 of none."""
-    largest = np.float32(-1.0)
-    for d in range(len(scores)):
-        largest = max(largest, scores[d])
-    return largest
+    """The largest of whole chunks of scores, -1 of none."""
+    a = b = c = d = np.float32(-1.0)
+    # Four at once: each maximum waits for the one before.
+    for i in range(0, len(scores), 4):
+        a, b = max(a, scores[i]), max(b, scores[i + 1])
+        c, d = max(c, scores[i + 2]), max(d, scores[i + 3])
+    return max(max(a, b), max(c, d))
+
+
+@njit(cache=True, nogil=True)
+def _first_at(scores: F32, least: np.float32) -> int:
+    """The first place of a score of ``least`` or more."""
+    size = np.int32(len(scores))
+    place = size
+    for i in range(size):
+        place = min(place, np.int32(i) if scores[i] >= least else size)
+    return int(place)
+
+
+@njit(cache=True, nogil=True)
+def _last_at(scores: F32, least: np.float32) -> int:
+    """The last place of a score of ``least`` or more, -1: none."""
+    place = np.int32(-1)
+    for i in range(len(scores)):
+        place = max(place, np.int32(i) if scores[i] >= least else np.int32(-1))
+    return int(place)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -204,16 +233,15 @@ def _match(
             continue
         xm = w - 1 - xk
         n = min(max_disparity, xk - half) + 1
-        _correlate(reference, mirrored, xk, yk, xm, half, sum_l / area, n, row, scores)
+        # With the usual size as a constant the sums stay in registers.
+        if half == USUAL_HALF:
+            _correlate(reference, mirrored, xk, yk, xm, USUAL_HALF, sum_l / area, n, row, scores)
+        else:
+            _correlate(reference, mirrored, xk, yk, xm, half, sum_l / area, n, row, scores)
         _normalise(scores[:n], mirrored_total, mirrored_squares, xm, yk, half, var_l)
-        score[k] = _largest(scores[:n])
-        best = 0
-        while scores[best] < score[k]:
-            best += 1
-        second[k] = max(_largest(scores[: max(best - 2, 0)]), _largest(scores[min(best + 3, n) : n]))
-        for d in range(n):
-            if scores[d] == second[k] and abs(d - best) > 2:
-                rival[k] = d
+        scores[n:] = NONE
+        score[k] = _largest(scores)
+        best = _first_at(scores, score[k])
         offset = np.float32(0.0)
         if 0 < best < n - 1:
             enclosed[k] = True
@@ -222,3 +250,8 @@ def _match(
             if curvature < 0.0:
                 offset = np.float32(0.5) * (before - after) / curvature
         disparity[k] = best + offset
+        scores[max(best - RIVAL_PX, 0) : best + RIVAL_PX + 1] = NONE
+        second[k] = _largest(scores)
+        other = _last_at(scores, second[k])
+        if other >= 0:
+            rival[k] = other
