@@ -628,6 +628,7 @@ examples:
   velod prove attacks                no certificate, forged velocity, floods, garbage, ...
   velod prove fuzz --runs 10000000   bad inputs for every decoder, in half an hour
   velod prove fleet --rigs 200       velocities of so many rigs through one router
+  velod prove scaling                one, two and three flow workers where one is too slow
   velod prove soak --seconds 120     two minutes of faults; half an hour without the option""",
     )
     actions = parser.add_subparsers(title="trials", metavar="TRIAL", required=True)

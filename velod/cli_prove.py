@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
 from dataclasses import asdict
-from typing import Any
+from typing import Any, TextIO
 
 from velod.cli_exit import RunFailed
 
@@ -32,13 +33,40 @@ def add_actions(actions: Any) -> None:
     soak.add_argument("--fault-every", type=float, default=20.0, metavar="S", help="on average (default 20)")
     soak.add_argument("--seed", type=int, default=1, help="of the faults (default 1)")
     soak.set_defaults(command=_soak)
-    for parser in (attacks, fuzz, fleet, soak):
+    scaling = actions("scaling", "throughput and latency against the number of flow workers; CPU and bytes by stage")
+    scaling.add_argument("--workers", type=int, default=3, help="from 1 to so many (default 3)")
+    scaling.add_argument(
+        "--load-ms", type=float, default=25.0, help="of artificial load on each batch of a flow worker (default 25)"
+    )
+    scaling.add_argument("--speed", type=float, default=1.0, help="of playing, times real time (default 1)")
+    scaling.add_argument("--seconds", type=float, default=5.0, help="of corridor-1, simulated once (default 5)")
+    scaling.set_defaults(command=_scaling)
+    for parser in (attacks, fuzz, fleet, soak, scaling):
         parser.add_argument("--json", metavar="OUT", help="write what was seen; - for stdout")
+
+
+def _out(args: argparse.Namespace) -> TextIO:
+    """Where words go, so that stdout is JSON alone where that was asked for."""
+    return sys.stderr if args.json == "-" else sys.stdout
+
+
+def _end(args: argparse.Namespace, result: Any, failures: Sequence[str]) -> int:
+    """Write the JSON. Raises RunFailed where something is not as claimed."""
+    from velod.cli_report import write_json
+
+    if args.json is not None:
+        write_json(args.json, result)
+    if failures:
+        raise RunFailed("; ".join(failures))
+    return 0
+
+
+def _say(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)
 
 
 def _attacks(args: argparse.Namespace) -> int:
     """Raises RunFailed where an attempt passed or something died."""
-    from velod.cli_report import write_json
     from velod.prove.attacks import besiege
     from velod.prove.besieged import SiegeError
     from velod.sim import simulated_recording
@@ -47,7 +75,7 @@ def _attacks(args: argparse.Namespace) -> int:
         siege = besiege(simulated_recording("corridor-1", 5.0, seed=1), speed=0.5)
     except SiegeError as e:
         raise RunFailed(str(e)) from None
-    out = sys.stderr if args.json == "-" else sys.stdout
+    out = _out(args)
     print("| attempt | by | what happened |\n|---|---|---|", file=out)
     for o in siege.outcomes:
         print(f"| {o.attempt} | {o.holder} | {o.happened}{'' if o.repelled else ' **PASSED**'} |", file=out)
@@ -57,20 +85,15 @@ def _attacks(args: argparse.Namespace) -> int:
         f" died: {', '.join(siege.died) or 'nobody'}; memory, MiB: {growth}",
         file=out,
     )
-    if args.json is not None:
-        write_json(args.json, asdict(siege))
-    if failures := siege.failures():
-        raise RunFailed("; ".join(failures))
-    return 0
+    return _end(args, asdict(siege), siege.failures())
 
 
 def _fuzz(args: argparse.Namespace) -> int:
     """Raises RunFailed where a decoder raised what it must not, or took memory without limit."""
-    from velod.cli_report import write_json
     from velod.prove.fuzz import SHARES, FuzzError, fuzz
 
     results = []
-    out = sys.stderr if args.json == "-" else sys.stdout
+    out = _out(args)
     for decoder, share in SHARES.items():
         try:
             result = fuzz(decoder, max(1, round(args.runs * share)), args.seed, args.corpus)
@@ -83,16 +106,11 @@ def _fuzz(args: argparse.Namespace) -> int:
             flush=True,
         )
         results.append(result)
-    if args.json is not None:
-        write_json(args.json, [asdict(result) for result in results])
-    if crashes := [f"{r.decoder}: {r.crash}" for r in results if r.crash]:
-        raise RunFailed("; ".join(crashes))
-    return 0
+    return _end(args, [asdict(r) for r in results], [f"{r.decoder}: {r.crash}" for r in results if r.crash])
 
 
 def _fleet(args: argparse.Namespace) -> int:
     """Raises RunFailed where more than a hundredth of the velocities did not come."""
-    from velod.cli_report import write_json
     from velod.prove.fleet import FleetError, run_fleet
 
     try:
@@ -104,31 +122,24 @@ def _fleet(args: argparse.Namespace) -> int:
         f" ({100 * fleet.share:.1f} %), {fleet.lost} lost, {fleet.silent} rigs not heard; latency p50"
         f" {fleet.latency_p50_ms:.2f} ms, p99 {fleet.latency_p99_ms:.2f} ms; cores: router {fleet.router_cores:.2f},"
         f" consumer {fleet.consumer_cores:.2f}, all rigs {fleet.rigs_cores:.2f}; router {fleet.router_mib:.0f} MiB",
-        file=sys.stderr if args.json == "-" else sys.stdout,
+        file=_out(args),
     )
-    if args.json is not None:
-        write_json(args.json, asdict(fleet))
-    if fleet.share < 0.99:
-        raise RunFailed(f"{100 * fleet.share:.1f} % of the velocities came")
-    return 0
+    failures = [] if fleet.share >= 0.99 else [f"{100 * fleet.share:.1f} % of the velocities came"]
+    return _end(args, asdict(fleet), failures)
 
 
 def _soak(args: argparse.Namespace) -> int:
     """Raises RunFailed where memory, files or latency grow."""
-    from velod.cli_report import write_json
     from velod.prove.besieged import SiegeError
     from velod.prove.soak import soak
     from velod.sim import simulated_recording
 
-    def say(line: str) -> None:
-        print(line, file=sys.stderr, flush=True)
-
     try:
         recording = simulated_recording("corridor-1", 5.0, seed=1)
-        result = soak(recording, args.seconds, args.fault_every, args.seed, say)
+        result = soak(recording, args.seconds, args.fault_every, args.seed, _say)
     except SiegeError as e:
         raise RunFailed(str(e)) from None
-    out = sys.stderr if args.json == "-" else sys.stdout
+    out = _out(args)
     hits = ", ".join(f"{fault} {n} times" for fault, n in sorted(result.faults.items()))
     print(
         f"{result.seconds:.0f} s; faults: {hits or 'none'}; {result.served} valid velocities,"
@@ -143,8 +154,34 @@ def _soak(args: argparse.Namespace) -> int:
             f" for each death {p.death_mib:+.2f} MiB, {p.death_files:+.1f} files",
             file=out,
         )
-    if args.json is not None:
-        write_json(args.json, asdict(result))
-    if failures := result.failures():
-        raise RunFailed("; ".join(failures))
-    return 0
+    return _end(args, asdict(result), result.failures())
+
+
+def _scaling(args: argparse.Namespace) -> int:
+    """Raises RunFailed where the processes do not come up."""
+    from velod.prove.scaling import ScalingError, scaling
+    from velod.sim import simulated_recording
+
+    try:
+        recording = simulated_recording("corridor-1", args.seconds, seed=1)
+        rows = scaling(recording, list(range(1, args.workers + 1)), args.load_ms, args.speed, _say)
+    except ScalingError as e:
+        raise RunFailed(str(e)) from None
+    out = _out(args)
+    stages = list(rows[0].costs)
+    print(
+        "| flow workers | batches closed /s | flow /s | dropped | shed | p50, ms | p99, ms | "
+        + " | ".join(f"{stage}: cores, MB/s" for stage in stages)
+        + " |\n"
+        + "|---" * (7 + len(stages))
+        + "|",
+        file=out,
+    )
+    for r in rows:
+        costs = " | ".join(f"{r.costs[stage].cores:.2f}, {r.costs[stage].mb_s:.1f}" for stage in stages)
+        print(
+            f"| {r.workers} | {r.closed_hz:.1f} | {r.flow_hz:.1f} | {r.dropped} | {r.shed} |"
+            f" {r.latency_p50_ms:.1f} | {r.latency_p99_ms:.1f} | {costs} |",
+            file=out,
+        )
+    return _end(args, [asdict(row) for row in rows], [])

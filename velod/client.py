@@ -13,8 +13,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import zenoh
@@ -24,6 +23,7 @@ from velod.runtime.access import may_read
 from velod.runtime.inbox import Inbox
 from velod.runtime.measure import GapCounter, HostClocks
 from velod.runtime.session import SessionError, open_session
+from velod.runtime.stacked import Stacked
 from velod.types import Velocity
 from velod.wire import Envelope, WireError, decode
 from velod.wire.topics import ALIVE, ANY_RIG, DEPTH, DONE, FLOW, VELOCITY, Topic, key, parts
@@ -56,11 +56,12 @@ class Received:
         return (self.t_received_ns - self.envelope.t_pub_ns) * 1e-9
 
 
-class Listener:
+class Listener(Stacked):
     """Messages of any topics of one rig, or of all (``"*"``). A context manager; nothing is received outside it.
 
     The connection is made, and made again after a loss, in the background. Each topic keeps the newest
-    ``topic.qos.depth`` messages.
+    ``topic.qos.depth`` messages. To enter it raises velod.runtime.session.SessionError: endpoint malformed,
+    certificate or role of no use, refused.
     """
 
     def __init__(self, rig: str, topics: tuple[Topic, ...], settings: ZenohSettings) -> None:
@@ -70,27 +71,20 @@ class Listener:
         self._settings = settings
         self._inbox = Inbox()
         self._gaps: dict[tuple[str, str], GapCounter] = {}  # by topic and key
-        self._stack = ExitStack()
         self._session: Any = None
 
-    def __enter__(self) -> Self:
-        """Raises velod.runtime.session.SessionError: endpoint malformed, certificate or role of no use, refused."""
+    def _open(self, stack: ExitStack) -> None:
         role = self._settings.role
         for topic in self._topics.values():
             if self._settings.connect.startswith("tls/") and not may_read(role, topic):
                 raise SessionError(f"the role {role} may not read {topic.name}")
-        with ExitStack() as stack:
-            self._session = stack.enter_context(open_session(self._settings))
-            for topic in self._topics.values():
-                stack.enter_context(self._subscribe(topic))
-            self._stack = stack.pop_all()
-        return self
+        self._session = stack.enter_context(open_session(self._settings))
+        for topic in self._topics.values():
+            stack.enter_context(self._subscribe(topic))
+        stack.callback(self._forget_session)
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def _forget_session(self) -> None:
         self._session = None
-        self._stack.close()
 
     def _subscribe(self, topic: Topic) -> Any:
         # A queue for each rig: a hundred rigs must not push each other's newest messages out of one.
@@ -158,7 +152,7 @@ class Listener:
         return counts
 
 
-class VelocityClient:
+class VelocityClient(Stacked):
     """The stream of velocities of one rig, or of all (``"*"``): ``rig`` then says whose velocity was the last one.
 
     A context manager and an endless iterable of valid velocities (``valid_only=False``: of all), in order of sensor
@@ -168,7 +162,8 @@ class VelocityClient:
     cannot be known, because the publisher's clock is not in step with this host's (counted as ``age.unknown``; such
     are not stale, whatever they are). ``max_age_s = math.inf`` keeps everything, as for a replay in slow motion.
     ``tls/`` endpoints need ``keys``, a folder with certificates; ``tcp/`` ones on other hosts have to be allowed with
-    ``insecure``.
+    ``insecure``. To enter it raises velod.runtime.session.SessionError: endpoint malformed, certificate of no use,
+    TLS refused.
     """
 
     def __init__(
@@ -191,15 +186,8 @@ class VelocityClient:
         self._t_ns: dict[str, int] = {}  # by key: sensor time of the newest one handed out
         self._clocks: dict[str, HostClocks] = {}  # by key
 
-    def __enter__(self) -> Self:
-        """Raises velod.runtime.session.SessionError: endpoint malformed, certificate of no use, TLS refused."""
-        self._listener.__enter__()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._listener.__exit__(kind, error, trace)
+    def _open(self, stack: ExitStack) -> None:
+        stack.enter_context(self._listener)
 
     def __iter__(self) -> Iterator[Velocity]:
         while (velocity := self.receive()) is not None:

@@ -17,8 +17,9 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
-from types import TracebackType
-from typing import IO, Any, Self
+from typing import IO, Any
+
+from velod.runtime.stacked import Stacked
 
 SHAPER = Path(__file__).with_name("shaper.py")
 _SHARED_MEMORY = Path("/dev/shm")
@@ -76,7 +77,7 @@ class Host:
         self._network.insert_shaper(self, delay_ms, loss, mbit)
 
 
-class Network:
+class Network(Stacked):
     """Hosts ``name -> Host`` on one switch. A context manager; nothing is made outside it."""
 
     def __init__(self, *names: str) -> None:
@@ -88,26 +89,17 @@ class Network:
             )
             for i, name in enumerate(names, 1)
         }
-        self._stack = ExitStack()
 
     def __getitem__(self, name: str) -> Host:
         return self.hosts[name]
 
-    def __enter__(self) -> Self:
-        with ExitStack() as stack:
-            self._add_namespace(stack, self.switch)
-            _ip("-n", self.switch, "link", "add", "br0", "type", "bridge")
-            _ip("-n", self.switch, "link", "set", "br0", "up")
-            for host in self.hosts.values():
-                self._add_host(stack, host)
-            self._introduce()
-            self._stack = stack.pop_all()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._stack.close()
+    def _open(self, stack: ExitStack) -> None:
+        self._add_namespace(stack, self.switch)
+        _ip("-n", self.switch, "link", "add", "br0", "type", "bridge")
+        _ip("-n", self.switch, "link", "set", "br0", "up")
+        for host in self.hosts.values():
+            self._add_host(stack, host)
+        self._introduce()
 
     def _add_namespace(self, stack: ExitStack, namespace: str) -> None:
         _ip("netns", "add", namespace)

@@ -21,7 +21,6 @@ from velod.geometry.calibration import save_calibration
 from velod.io import Recording, open_recording
 
 CONSUMER = Path(__file__).with_name("consumer.py")
-SLOW_WORKER = Path(__file__).with_name("slow_worker.py")
 PORT = 17447
 UP_S = 90.0
 """Workers of a busy machine take their time to load."""
@@ -179,7 +178,7 @@ class Rig:
 
     def start_slow_worker(self, host: str, worker: str, ms: float) -> subprocess.Popen[str]:
         """A flow worker that takes so much longer for each batch, until it is up."""
-        command = [sys.executable, "-P", str(SLOW_WORKER), self.endpoint, worker, str(ms)]
+        command = [sys.executable, "-P", "-m", "velod.prove.slow_worker", self.endpoint, worker, str(ms)]
         process = self.start(self.network[host], worker, command)
         self.wait_for(worker, "INFO up", 1)
         return process

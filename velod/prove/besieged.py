@@ -14,8 +14,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from threading import Event, Thread
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import zenoh
 
@@ -27,6 +26,7 @@ from velod.io import open_recording
 from velod.runtime.certificates import make_keys
 from velod.runtime.key_paths import KeyPaths
 from velod.runtime.session import client_tree, open_session, to_config
+from velod.runtime.stacked import Stacked
 from velod.types import Health
 from velod.wire.topics import HEALTH
 
@@ -40,14 +40,13 @@ class SiegeError(RuntimeError):
     """The service did not come up, or the sensor could not reach it; one line."""
 
 
-class Besieged:
+class Besieged(Stacked):
     """A context manager: `velod run` listening with TLS on loopback, a driver process that plays a recording to it
     over TLS at ``speed``, and a consumer over TLS. All processes are those that a user starts.
     """
 
     def __init__(self, recording: Path, speed: float) -> None:
         self._recording, self._speed = recording, speed
-        self._stack = ExitStack()
         self._health: dict[str, Health] = {}
         self._heard_s: list[float] = []  # when the consumer was handed a velocity
         self._stop = Event()
@@ -55,29 +54,21 @@ class Besieged:
         self.keys = Path()
         self.driver_pid = 0
 
-    def __enter__(self) -> Self:
+    def _open(self, stack: ExitStack) -> None:
         """Raises SiegeError."""
-        with ExitStack() as stack:
-            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="velod-siege-")))
-            self.keys = folder / "keys"
-            make_keys(self.keys, rigs=(RIG, OTHER_RIG))
-            self._start(stack, ["velod.cli", "run", "-c", str(self._settings(folder))])
-            here = ZenohSettings(connect=f"tcp/127.0.0.1:{self.port}")
-            self._watch(stack, Listener(RIG, (HEALTH,), here), self._note_health)
-            self.wait_until(lambda: set(STAGES) <= set(self._health), START_S, "the service is not up")
-            self.insider = stack.enter_context(open_session(here))
-            # At another speed than 1 the sensor's time says nothing of age.
-            self._watch(stack, VelocityClient(RIG, self.endpoint, math.inf, keys=str(self.keys)), self._note_velocity)
-            player = ["velod.runtime.player", str(self._recording), *self._player_arguments()]
-            self.driver_pid = self._start(stack, player)
-            self.wait_until(lambda: len(self._heard_s) > 10, START_S, "no velocity came")
-            self._stack = stack.pop_all()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._stack.close()
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="velod-siege-")))
+        self.keys = folder / "keys"
+        make_keys(self.keys, rigs=(RIG, OTHER_RIG))
+        self._start(stack, ["velod.cli", "run", "-c", str(self._settings(folder))])
+        here = ZenohSettings(connect=f"tcp/127.0.0.1:{self.port}")
+        self._watch(stack, Listener(RIG, (HEALTH,), here), self._note_health)
+        self.wait_until(lambda: set(STAGES) <= set(self._health), START_S, "the service is not up")
+        self.insider = stack.enter_context(open_session(here))
+        # At another speed than 1 the sensor's time says nothing of age.
+        self._watch(stack, VelocityClient(RIG, self.endpoint, math.inf, keys=str(self.keys)), self._note_velocity)
+        player = ["velod.runtime.player", str(self._recording), *self._player_arguments()]
+        self.driver_pid = self._start(stack, player)
+        self.wait_until(lambda: len(self._heard_s) > 10, START_S, "no velocity came")
 
     @property
     def endpoint(self) -> str:

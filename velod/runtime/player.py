@@ -14,8 +14,6 @@ from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from threading import Condition, Event
-from types import TracebackType
-from typing import Self
 
 import zenoh
 
@@ -28,6 +26,7 @@ from velod.runtime.outlet import Outlet
 from velod.runtime.prefetch import Prefetch
 from velod.runtime.prime import prime
 from velod.runtime.session import open_session
+from velod.runtime.stacked import Stacked
 from velod.runtime.stages import STAGES
 from velod.runtime.worker import (
     EXIT_USAGE,
@@ -64,31 +63,22 @@ class PlayerError(RuntimeError):
     """Playing cannot go on; the text says why."""
 
 
-class Service:
+class Service(Stacked):
     """What a player sees of the service: which stages are alive, and the newest velocity. A context manager."""
 
     def __init__(self, session: zenoh.Session, rig: str) -> None:
         self._session, self._rig = session, rig
         self._alive: set[tuple[str, str]] = set()
         self._changed = Condition()
-        self._stack = ExitStack()
         self.velocity_t_ns = 0
         self.heard_s = 0.0  # when the newest velocity came
 
-    def __enter__(self) -> Self:
-        with ExitStack() as stack:
-            callback = zenoh.handlers.Callback(self._on_token, indirect=False)
-            tokens = self._session.liveliness().declare_subscriber(key(ALIVE, self._rig), callback, history=True)
-            stack.enter_context(tokens)
-            callback = zenoh.handlers.Callback(self._on_velocity, indirect=False)
-            stack.enter_context(self._session.declare_subscriber(key(VELOCITY, self._rig), callback))
-            self._stack = stack.pop_all()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._stack.close()
+    def _open(self, stack: ExitStack) -> None:
+        callback = zenoh.handlers.Callback(self._on_token, indirect=False)
+        tokens = self._session.liveliness().declare_subscriber(key(ALIVE, self._rig), callback, history=True)
+        stack.enter_context(tokens)
+        callback = zenoh.handlers.Callback(self._on_velocity, indirect=False)
+        stack.enter_context(self._session.declare_subscriber(key(VELOCITY, self._rig), callback))
 
     def wait_until_up(self, stop: Event, timeout_s: float = START_S) -> None:
         """Wait for all stages. Raises PlayerError naming those that are missing."""

@@ -14,8 +14,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from threading import Event, Lock
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import zenoh
 
@@ -28,6 +27,7 @@ from velod.runtime.process import ChildProcess, LineSink, stop_all, to_stderr
 from velod.runtime.session import introducer_endpoint, open_session
 from velod.runtime.settings_service import fetch, serve
 from velod.runtime.spare import READY
+from velod.runtime.stacked import Stacked
 from velod.runtime.stages import STAGES, stage_of, worker_names
 from velod.runtime.worker import worker_arguments
 from velod.wire.topics import ALIVE, HEALTH, key, parts
@@ -55,7 +55,7 @@ class _Slot:
     last_death: str = ""
 
 
-class Supervisor:
+class Supervisor(Stacked):
     """A context manager that starts the workers and stops them; in between call ``step`` often, or ``run``."""
 
     def __init__(
@@ -81,7 +81,6 @@ class Supervisor:
         self._settings, self._calibration = settings, calibration
         self._stages, self._worker, self._wants_spare = tuple(stages), worker, spare
         self._on_line = on_line
-        self._stack = ExitStack()
         self._slots: dict[str, _Slot] = {}
         self._spare: ChildProcess | None = None
         self._spare_is_known = False  # to be ready: said once
@@ -91,29 +90,21 @@ class Supervisor:
         self._health = HealthReporter("supervisor", self._name)
         self.session: Any = None
 
-    def __enter__(self) -> Self:
+    def _open(self, stack: ExitStack) -> None:
         """Open the session, serve the settings, start the workers. Raises SessionError, NoServiceError."""
-        with ExitStack() as stack:
-            zenoh_settings = self._settings.zenoh
-            self.session = stack.enter_context(
-                open_session(zenoh_settings, not zenoh_settings.connect, (self._settings.rig.name,))
-            )
-            self._settings_from_service(stack)
-            # Health is for whoever can follow, even in a lossless replay.
-            self._outlet = stack.enter_context(Outlet(self.session, self._settings.rig.name))
-            self._watch_liveliness(stack)
-            stack.enter_context(prime.listen(self.session, self._settings.rig.name))
-            stack.callback(self.stop_workers)
-            for name in self._names():
-                self._slots[name] = _Slot(name)
-            self.step()
-            self._stack = stack.pop_all()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._stack.close()
+        zenoh_settings = self._settings.zenoh
+        self.session = stack.enter_context(
+            open_session(zenoh_settings, not zenoh_settings.connect, (self._settings.rig.name,))
+        )
+        self._settings_from_service(stack)
+        # Health is for whoever can follow, even in a lossless replay.
+        self._outlet = stack.enter_context(Outlet(self.session, self._settings.rig.name))
+        self._watch_liveliness(stack)
+        stack.enter_context(prime.listen(self.session, self._settings.rig.name))
+        stack.callback(self.stop_workers)
+        for name in self._names():
+            self._slots[name] = _Slot(name)
+        self.step()
 
     def run(self, stop: Event) -> None:
         """Keep the workers alive until ``stop`` is set."""

@@ -1,4 +1,4 @@
-"""A flow worker with an artificial work load: ``slow_worker.py ENDPOINT NAME MS``; each batch takes so much longer.
+"""A flow worker with an artificial work load, a process: ``ENDPOINT NAME MS``; each batch takes so much longer.
 
 It sleeps instead of computing, so that more workers are more capacity even where there are not more cores.
 """
