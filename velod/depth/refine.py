@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 
 from velod.events.columns import readonly
-from velod.events.plane_fit import REACH, PlaneFit, fit_plane, honest_rms, widen_plane
+from velod.events.plane_fit import INNER_AT, REACH, SIZE, WIDE_SIZE, PlaneFit, fit_plane, honest_rms, widen_plane
 from velod.geometry.rectify import Rectification
 from velod.types import F32, F64, I64, NS_PER_S, U8, U16, WIDE
 
@@ -90,7 +90,7 @@ def refine(
         rectification.right_covector,
         rectification.remap_right[0],
         rectification.remap_right[1],
-        np.empty((WIDE, WIDE)),
+        np.empty(WIDE_SIZE + SIZE),
         out.outcome,
         out.disparity,
         out.normal_x,
@@ -104,11 +104,15 @@ def _plane(surface: U16, p: int, x: int, y: int, unit_s: float, min_neighbours: 
     """The widened plane at (x, y), none as of ``fit_plane`` where its neighbours leave the sensor; ``age``: room."""
     if x < REACH or x >= surface.shape[2] - REACH or y < REACH or y >= surface.shape[1] - REACH:
         return 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    wide, inner = age[:WIDE_SIZE], age[WIDE_SIZE:]
     for i in range(WIDE):
+        row = surface[p, y + i - REACH, x - REACH : x + REACH + 1]
         for j in range(WIDE):
-            age[i, j] = surface[p, y + i - REACH, x + j - REACH] * unit_s
-    fit = fit_plane(age[1:-1, 1:-1].copy().reshape(-1), _REJECT_PX, _REJECTIONS, min_neighbours)
-    return widen_plane(fit, age.reshape(-1), _REJECT_PX, _MAX_RMS_PX)[0] if fit[0] > 0 else fit
+            wide[i * WIDE + j] = row[j] * unit_s
+    for i in range(SIZE):
+        inner[i] = wide[INNER_AT[i]]
+    fit = fit_plane(inner, _REJECT_PX, _REJECTIONS, min_neighbours)
+    return widen_plane(fit, wide, _REJECT_PX, _MAX_RMS_PX)[0] if fit[0] > 0 else fit
 
 
 @njit(cache=True, nogil=True)
