@@ -169,6 +169,15 @@ def test_a_restarted_ingest_is_followed():
     assert errors(velocities, FLIGHT).mean() < 0.08
 
 
+@pytest.mark.parametrize(("t_ns", "restarts"), [(10**12 + 5_000_000, 0), (5_000_000, 1)])
+def test_an_ingest_that_has_heard_no_event_yet_is_no_new_clock_unless_the_imu_says_so(t_ns, restarts):
+    stage = OptimizerStage(from_tree({}), CALIBRATION)
+    one = np.zeros((1, 3))
+    for event_t_ns, at_ns, seq in ((10**12, 10**12, 50), (0, t_ns, -1)):
+        stage.handle(ImuSamples(0, at_ns, event_t_ns, seq, event_t_ns, np.array([at_ns]), one, one))
+    assert stage.counters.get("clock.restart", 0) == restarts
+
+
 def test_a_hole_in_the_imu_of_seconds_starts_the_estimate_anew():
     stream = messages(FLIGHT, 3.0)
     holed = [m for m in stream if not 0.6e9 < m.t_ns < 2.2e9]

@@ -30,6 +30,14 @@ class ImuStream:
         self._counters = counters
         self._alarms = alarms
 
+    def take(self, packet: ImuPacket) -> list[tuple[I64, F64, F64]]:
+        """What ``accept`` makes of the packet and of those that waited for it. Raises ClockRestart."""
+        n = len(packet.sample_t_ns)
+        if n == 0 or packet.accel.shape != (n, 3) or packet.gyro.shape != (n, 3):
+            self._counters["packets.malformed"] += 1
+            return []
+        return [self.accept(p) for p in self.order.push(packet)]
+
     def accept(self, packet: ImuPacket) -> tuple[I64, F64, F64]:
         """Good samples of the packet: times on the camera's clock (t_imu - time_offset, Kalibr), accel, gyro."""
         value = np.hstack([packet.accel, packet.gyro])

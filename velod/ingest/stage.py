@@ -98,17 +98,13 @@ class IngestStage:
         return self._left if packet.camera == "left" else self._right
 
     def _on_imu(self, packet: ImuPacket) -> list[Output]:
-        n = len(packet.sample_t_ns)
-        if n == 0 or packet.accel.shape != (n, 3) or packet.gyro.shape != (n, 3):
-            self.counters["packets.malformed"] += 1
-            return []
         try:
-            ordered = self._imu.order.push(packet)
+            taken = self._imu.take(packet)
         except ClockRestart:
             self.counters["clock.restart"] += 1
             self._start_epoch()
-            ordered = self._imu.order.push(packet)
-        return [self._imu_samples(*self._imu.accept(p)) for p in ordered]
+            taken = self._imu.take(packet)
+        return [self._imu_samples(*samples) for samples in taken]
 
     def _imu_samples(self, t_ns: I64, accel: F64, gyro: F64) -> ImuSamples:
         self._imu_seq += 1

@@ -92,6 +92,11 @@ class OptimizerStage:
         self._now_ns = max(self._now_ns, message.t_ns)
         return self._advance()
 
+    @property
+    def time_offset_s(self) -> float:
+        """Of the IMU's clock, by the calibration: t_imu = t_cam + time_offset_s."""
+        return self._calibration.time_offset_s
+
     def reset_odometry(self) -> None:
         """Begin a new dead reckoning with the next valid velocity."""
         self._reckoning.stop()
@@ -110,7 +115,8 @@ class OptimizerStage:
             self._count("batch.of_another_ingest")
 
     def _take_imu(self, m: ImuSamples) -> None:
-        if m.event_t_ns + CLOCK_RESTART_NS < self._event_t_ns:
+        # An ingest that has not heard of any event yet says 0: then the IMU tells.
+        if (m.event_t_ns or m.t_ns) + CLOCK_RESTART_NS < self._event_t_ns:
             self._count("clock.restart")
             self._reset()
         elif m.batch_seq < self._closed_seq:

@@ -14,11 +14,12 @@ import zenoh
 from velod.config import Settings
 from velod.runtime.budget import LoadShedder
 from velod.runtime.dispatching import BatchDispatch
+from velod.runtime.imu_bridge import ImuBridge
 from velod.runtime.inbox import Item
 from velod.runtime.measure import SensorClock
 from velod.runtime.sensor_clock import SensorClockFit
 from velod.runtime.shell import WorkerShell
-from velod.runtime.stages import Limited, Reckoning, Stage
+from velod.runtime.stages import Inertial, Limited, Reckoning, Stage
 from velod.runtime.succession import Succession, Turn
 from velod.types import DepthBatch, Done, EventBatch, FlowBatch, ImuSamples, Message, Odometry, StereoBatch, Velocity
 from velod.wire import Envelope, decode
@@ -192,6 +193,10 @@ class OptimizerShell(WorkerShell):
         self._clock = SensorClock()
         self._succession: Succession[_Output] = Succession(worker)
         self._odometry_seq = 0
+        self._bridge: ImuBridge | None = None
+        # A lossless replay waits for ingest instead.
+        if isinstance(stage, Inertial) and not settings.zenoh.lossless:
+            self._bridge = ImuBridge(settings.ingest, stage.time_offset_s)
 
     def subscribe(self, stack: ExitStack) -> None:
         """The stage's inputs; what other optimizers publish, and their coming and going, before anything else."""
@@ -199,6 +204,8 @@ class OptimizerShell(WorkerShell):
         for topic in (VELOCITY, ODOMETRY):
             self._listen_to_peers(stack, topic)
         self._answer_resets(stack)
+        if self._bridge is not None:
+            self.listen(stack, IMU_SENSOR, key(IMU_SENSOR, self.rig))
         super().subscribe(stack)
 
     def _answer_resets(self, stack: ExitStack) -> None:
@@ -232,7 +239,10 @@ class OptimizerShell(WorkerShell):
             self._publish_turns(self._succession.left(token["worker"], time.monotonic()))
 
     def take_other(self, item: Item) -> bool:
-        """What another optimizer has published, and resets of the odometry."""
+        """What another optimizer has published, resets of the odometry, and the sensor's own IMU packets."""
+        if self._bridge is not None and item.source == IMU_SENSOR.name:
+            self._bridge.keep(item.data)
+            return True
         if item.source == ODOMETRY_RESET.name:
             if isinstance(self.stage, Reckoning):
                 self.stage.reset_odometry()
@@ -247,6 +257,16 @@ class OptimizerShell(WorkerShell):
         else:
             self._succession.heard(item.key, message.t_ns, message.seq, time.monotonic())
         return True
+
+    def handle(self, message: Message) -> Sequence[Message]:
+        """IMU samples by way of the bridge, which knows what the stage has had already."""
+        if self._bridge is None or not isinstance(message, ImuSamples):
+            return super().handle(message)
+        return [
+            output
+            for samples in self._bridge.from_ingest(message, time.monotonic())
+            for output in super(OptimizerShell, self).handle(samples)
+        ]
 
     def publish(self, outputs: Sequence[Message], cause: Envelope) -> None:
         """Hand the outputs over for publication, here or by another optimizer."""
@@ -265,7 +285,11 @@ class OptimizerShell(WorkerShell):
                 self._publish_turns(self._succession.offer(output.t_ns, made, time.monotonic()))
 
     def every_round(self) -> None:
-        """Take over where it is time to."""
+        """Go on without ingest, and take over from another optimizer, where it is time to."""
+        for samples in [] if self._bridge is None else self._bridge.due(time.monotonic()):
+            cause = Envelope(samples, time.time_ns(), 0)
+            with self.survived(key(IMU_SENSOR, self.rig), cause):
+                self.publish(self.stage.handle(samples), cause)
         self._publish_turns(self._succession.look(time.monotonic()))
 
     def _publish_turns(self, turns: Sequence[Turn[_Output]]) -> None:
@@ -291,8 +315,9 @@ class OptimizerShell(WorkerShell):
         return self._succession.role
 
     def counters(self) -> dict[str, int]:
-        """With those of the succession."""
-        return {**super().counters(), **self._succession.counters}
+        """With those of the succession and of the bridge."""
+        bridged = {} if self._bridge is None else self._bridge.counters
+        return {**super().counters(), **self._succession.counters, **bridged}
 
 
 SHELLS: dict[str, type[WorkerShell]] = {

@@ -98,6 +98,10 @@ class WorkerShell:
         """A message that is not for the stage."""
         raise NotImplementedError(source)
 
+    def handle(self, message: Message) -> Sequence[Message]:
+        """Hand a message to the stage."""
+        return self.stage.handle(message)
+
     def publish(self, outputs: Sequence[Message], cause: Envelope) -> None:
         """Publish what the stage made of ``cause``."""
         raise NotImplementedError
@@ -202,13 +206,13 @@ class WorkerShell:
             return
         self._note_arrival(topic, item.key, envelope.message)
         outputs: Sequence[Message] = []
-        with self._survived(item.key, envelope):
-            outputs = self.stage.handle(envelope.message)
-        with self._survived(item.key, envelope):
+        with self.survived(item.key, envelope):
+            outputs = self.handle(envelope.message)
+        with self.survived(item.key, envelope):
             self.publish(outputs, envelope)
 
     @contextmanager
-    def _survived(self, at: str, envelope: Envelope) -> Iterator[None]:
+    def survived(self, at: str, envelope: Envelope) -> Iterator[None]:
         """A worker outlives whatever one message does to it."""
         try:
             yield

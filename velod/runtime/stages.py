@@ -43,6 +43,16 @@ class Reckoning(Protocol):
         ...
 
 
+@runtime_checkable
+class Inertial(Protocol):
+    """A stage that goes on by the IMU alone."""
+
+    @property
+    def time_offset_s(self) -> float:
+        """Of the IMU's clock: t_imu = t_cam + time_offset_s."""
+        ...
+
+
 _CLASSES = {
     "ingest": ("velod.ingest.stage", "IngestStage"),
     "flow": ("velod.flow.stage", "FlowStage"),
