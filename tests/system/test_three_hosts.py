@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -39,26 +40,42 @@ def run(rig: Rig) -> Seen:
     return rig.seen(consumer)
 
 
-def assert_as_on_one_host(rig: Rig, seen: Seen) -> None:
+@dataclass(frozen=True, slots=True)
+class Compared:
+    """A run on three hosts beside one in a single process."""
+
+    ave_here_mps: float
+    ave_there_mps: float
+    share_of_velocities: float  # of those of one process, that came
+    equal: float  # share of those that came, to the bit
+    apart_mps: float  # mean distance of the velocities of a moment
+
+
+def compared(rig: Rig, seen: Seen) -> Compared:
     recording = rig.recorded()
     alone = run_offline(Settings(), recording.calibration, recording.packets())
+    there = [as_velocity(row) for row in seen.used]
     assert recording.truth is not None
-    here, there = (
-        evaluate(velocities, recording.truth, recording.t_start_ns)
-        for velocities in (alone, [as_velocity(row) for row in seen.used])
+    of_one, of_three = (evaluate(v, recording.truth, recording.t_start_ns) for v in (alone, there))
+    same = {v.t_ns: v.v_B for v in alone}
+    apart_mps = np.array([np.linalg.norm(v.v_B - same[v.t_ns]) for v in there])
+    found = Compared(
+        of_one.ave_mps, of_three.ave_mps, of_three.n / of_one.n, float(np.mean(apart_mps == 0.0)), apart_mps.mean()
     )
-    logging.getLogger("tests").info("AVE %.4f m/s on one host, %.4f on three", here.ave_mps, there.ave_mps)
-    # Velocities without a batch that came too late differ a little; on a machine with time to spare there are none.
-    assert there.ave_mps == pytest.approx(here.ave_mps, abs=2e-3)
-    assert there.n >= 0.98 * here.n
-    same = {v.t_ns: v.v_B.tolist() for v in alone}
-    equal = [row["v_B"] == same[row["sensor_t_ns"]] for row in seen.used]
-    assert np.mean(equal) > 0.9
+    p50_ms, p99_ms = np.percentile(seen.latency_ms(), (50, 99))
+    logging.getLogger("tests").info(
+        "%s, longest gap %.3f s, latency %.1f, %.1f ms", found, seen.longest_gap_s(), p50_ms, p99_ms
+    )
+    return found
 
 
 def test_three_hosts_give_the_velocities_of_one(rig: Rig) -> None:
     seen = run(rig)
-    assert_as_on_one_host(rig, seen)
+    found = compared(rig, seen)
+    assert found.ave_there_mps == pytest.approx(found.ave_here_mps, abs=2e-3)
+    assert found.share_of_velocities >= 0.98
+    # Velocities without a batch that came too late differ a little; on a machine with time to spare there are none.
+    assert found.equal > 0.9
     assert seen.lost() == 0
     assert seen.longest_gap_s() <= 0.1
     assert seen.counters == {}
@@ -68,5 +85,10 @@ def test_three_hosts_give_the_velocities_of_one(rig: Rig) -> None:
 def test_the_demo_on_three_hosts(rig: Rig, simulated: Callable[[str, float], Path]) -> None:
     rig.recording = simulated("corridor-1", 10.0)
     seen = run(rig)
-    assert_as_on_one_host(rig, seen)
+    found = compared(rig, seen)
+    assert found.ave_there_mps == pytest.approx(found.ave_here_mps, abs=2e-3)
+    assert found.share_of_velocities >= 0.98
+    # A batch that came too late, or that ingest did not make, changes all velocities after it a little: no bits here.
+    assert found.apart_mps < 0.01
     assert seen.lost() == 0
+    assert seen.longest_gap_s() <= 0.1
