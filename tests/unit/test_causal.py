@@ -12,7 +12,7 @@ from hypothesis import settings as examples
 from hypothesis import strategies as st
 
 from tests.moving_edges import HEIGHT, T0_NS, WIDTH, Events, edges
-from velod.events.causal import ages_of, all_open, enter_and_select
+from velod.events.causal import all_open, enter_and_select, split_ages
 from velod.events.plane_fit import fit_plane
 from velod.events.sae import NEVER, new_surface, update_sae
 from velod.events.selection import GOOD, MAX_ASYMMETRY
@@ -147,6 +147,16 @@ def test_a_full_buffer_takes_no_more() -> None:
     assert np.array_equal(selected(events, capacity=7).at, selected(events).at[:7])
 
 
-def test_ages_are_counted_from_the_end_and_end_with_the_memory() -> None:
-    stamps = np.array([[T0_NS, T0_NS - MEMORY + 5, T0_NS - MEMORY, NEVER]])
-    assert ages_of(stamps, T0_NS + 5, MEMORY).tolist() == [[5, MEMORY, 0, 0]]
+def test_ages_are_counted_from_the_end_end_with_the_memory_and_are_split_into_middle_and_ring() -> None:
+    rng = np.random.default_rng(3)
+    stamps = T0_NS - rng.integers(0, 2 * MEMORY, (5, 7, 7))
+    stamps[0, 0, :4] = T0_NS, T0_NS - MEMORY + 5, T0_NS - MEMORY, NEVER
+    ages = np.where(T0_NS + 5 - stamps <= MEMORY, T0_NS + 5 - stamps, 0)
+    assert ages[0, 0, :4].tolist() == [5, MEMORY, 0, 0]
+    age, patch, ring = np.empty(5, np.uint32), np.empty((5, 25), np.uint32), np.empty((5, 24), np.uint32)
+    split_ages(stamps.reshape(5, 49), T0_NS + 5, MEMORY, age, patch, ring)
+    inner = np.zeros((7, 7), bool)
+    inner[1:6, 1:6] = True
+    assert np.array_equal(age, ages[:, 3, 3])
+    assert np.array_equal(patch, ages[:, inner])
+    assert np.array_equal(ring, ages[:, ~inner])

@@ -9,13 +9,13 @@ from __future__ import annotations
 import numpy as np
 
 from velod.config import Settings
-from velod.events.causal import ages_of, all_open, enter_and_select
-from velod.events.plane_fit import INNER_AT, RING_AT, WIDE_SIZE
+from velod.events.causal import all_open, enter_and_select, split_ages
+from velod.events.plane_fit import SIZE, WIDE_SIZE
 from velod.events.sae import new_surface
 from velod.events.selection import cell_side_px
 from velod.ingest.batch import OpenBatch
 from velod.ingest.stream import CameraStream
-from velod.types import U8, U16, U32, EventBatch
+from velod.types import RING, U8, U16, U32, EventBatch
 
 MAX_SELECTED = 65_535
 """Events that one batch can carry (uint16 positions); a batch that is full selects no more."""
@@ -116,14 +116,14 @@ class Slices:
         self._seq += 1
         first, new = self._sent, slice(self._sent, self._n)
         n_events, self._n_events = self._n_events, 0
+        n, self._sent = self._n - self._sent, self._n
         p, y, x = self._at[new].T
-        wide = ages_of(self._stamps[new], t_end_ns, self._memory_ns)
-        self._sent = self._n
+        age, patch, ring = np.empty(n, np.uint32), np.empty((n, SIZE), np.uint32), np.empty((n, RING), np.uint32)
+        split_ages(self._stamps[new], t_end_ns, self._memory_ns, age, patch, ring)
         if self._t_start_ns < 0:
             assert batch.t_start_ns is not None
             self._t_start_ns = batch.t_start_ns
         return EventBatch(
             self._seq, t_end_ns, self._t_start_ns, n_events,
-            x.astype(np.uint16), y.astype(np.uint16), wide[:, MIDDLE].copy(), p.astype(np.uint8), wide[:, INNER_AT],
-            batch_seq, first, wide[:, RING_AT],
+            x.astype(np.uint16), y.astype(np.uint16), age, p.astype(np.uint8), patch, batch_seq, first, ring,
         )  # fmt: skip
