@@ -219,6 +219,7 @@ first steps:
         _add_view,
         _add_doctor,
         _add_router,
+        _add_relay,
         _add_config,
         _add_bench,
         _add_prove,
@@ -554,6 +555,24 @@ def _add_router(commands: _Commands[argparse.ArgumentParser]) -> None:
     )
     _add_config_option(parser)
     cli_network.add_router_options(parser)
+
+
+def _add_relay(commands: _Commands[argparse.ArgumentParser]) -> None:
+    parser = _command(
+        commands,
+        "relay",
+        cli_network.relay,
+        "Velocities from one network to another, the newest of each rig so often.",
+        "A client of both: of a site's router, where the rigs are, and of one further up. Nothing else crosses, and\n"
+        "neither network learns of the other's routers. seq counts anew; the times of publication stay, so ages are\n"
+        "true where the clocks agree.",
+        "  velod relay --connect tls/site-a:17448 --keys site-keys --to tls/top.example:17448 --to-keys top-keys\n"
+        "                                        one velocity a second of every rig of the site\n"
+        "  velod relay --rig drone --hz 10 --to tls/top.example:17448 --to-keys top-keys\n"
+        "                                        of one rig, of the velod on this host",
+    )
+    _add_config_option(parser)
+    cli_network.add_relay_options(parser, LOCAL)
 
 
 def _add_config(commands: _Commands[argparse.ArgumentParser]) -> None:

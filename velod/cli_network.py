@@ -1,4 +1,4 @@
-"""``velod router``, ``velod config keys`` and ``velod config topology``: velod on networks."""
+"""``velod router``, ``velod relay``, ``velod config keys`` and ``velod config topology``: velod on networks."""
 
 from __future__ import annotations
 
@@ -51,6 +51,18 @@ def add_router_options(parser: argparse.ArgumentParser) -> None:
     add_guard_options(parser)
 
 
+def add_relay_options(parser: argparse.ArgumentParser, default: str) -> None:
+    """From where, to where, how often."""
+    parser.add_argument("--to", metavar="ENDPOINT", required=True, help="the other network's router")
+    parser.add_argument("--to-keys", metavar="DIR", help="certificates for it, if they are not those of --keys")
+    parser.add_argument(
+        "--to-role", choices=_ROLES, default="worker", help="as whom to publish there (default worker)"
+    )
+    parser.add_argument("--hz", type=float, default=1.0, help="velocities per second and rig (default 1)")
+    add_way_options(parser, default)
+    parser.set_defaults(rig="*")
+
+
 def add_config_actions(keys: argparse.ArgumentParser, topology: argparse.ArgumentParser) -> None:
     """The options of ``velod config keys`` and ``velod config topology``."""
     keys.add_argument("folder", metavar="DIR", help="where to write; a CA that is there already signs")
@@ -88,6 +100,23 @@ def router(args: argparse.Namespace) -> int:
     )
     start_logging("router")
     run_router(zenoh, args.rig, stop_on_signals())
+    return 0
+
+
+def relay(args: argparse.Namespace) -> int:
+    """Pass velocities on until SIGINT or SIGTERM."""
+    from velod.cli_watch import place_of
+    from velod.config import ZenohSettings
+    from velod.relay import relay as run
+    from velod.runtime.worker import start_logging, stop_on_signals
+
+    if not 0.0 < args.hz <= 1000.0:
+        raise ValueError(f"--hz {args.hz:g}: must be above 0 and at most 1000")
+    place = place_of(args.config, way_of(args), "consumer")
+    keys = args.to_keys or place.zenoh.keys
+    target = ZenohSettings(connect=args.to, keys=keys, role=args.to_role, insecure=place.zenoh.insecure)
+    start_logging("relay")
+    run(place.zenoh, target, place.rig, args.hz, stop_on_signals())
     return 0
 
 
