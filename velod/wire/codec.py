@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from velod.types import Message
-from velod.wire.schema import MESSAGE_TYPES, OFFSET, VERSION, Field, Schema, WireError, schema
+from velod.wire.schema import INT64, MESSAGE_TYPES, OFFSET, VERSION, Field, Schema, WireError, schema
 from velod.wire.unpack import unpack_views
 
 MAX_BYTES = 64 << 20
@@ -30,7 +30,6 @@ _PACKER_BYTES = 4096
 """Room for one thing that is no column; the packer's buffer grows where it needs more."""
 _MAX_STR = 1 << 16
 _MAX_MAP = 1024
-_INT64 = (-(2**63), 2**63 - 1)
 _TIMES = np.dtype("<i8")
 _BIN_TYPES = (bytes, memoryview)
 _WORTH_VIEWS = 16_384
@@ -144,7 +143,7 @@ def _host_times() -> tuple[Field, ...]:
 def _unpack(data: bytes | bytearray | memoryview) -> dict[str, Any]:
     if len(data) > MAX_BYTES:
         raise WireError("wire.too_large", f"{len(data)} bytes, the limit is {MAX_BYTES}")
-    if len(data) > _WORTH_VIEWS and (views := unpack_views(data)) is not None:
+    if len(data) > _WORTH_VIEWS and not isinstance(data, memoryview) and (views := unpack_views(data)) is not None:
         return views
     try:
         tree = msgpack.unpackb(
@@ -183,10 +182,10 @@ def _short(value: Any) -> str:
 def _sizes(s: Schema, tree: dict[str, Any]) -> dict[str, int]:
     """Every dim of a received message: scalars that were sent, and the rows of the longest column."""
     sizes = {
-        d.name: _read_int(s, _int_field(d.name, 0, _INT64[1]), tree, {}) if d.sent else 0 for d in s.dims.values()
+        d.name: _read_int(s, _int_field(d.name, 0, INT64[1]), tree, {}) if d.sent else 0 for d in s.dims.values()
     }
     for f in s.fields:
-        if f.counts_rows and _sent(f, tree):
+        if f.counts_rows and (f.name in tree or not f.optional):
             rows = -(-len(_bin(s, f, tree)) // f.row_bytes)
             sizes[f.counts_rows] = max(sizes[f.counts_rows], rows)
     for dim in s.dims.values():
@@ -212,28 +211,25 @@ def _get(s: Schema, name: str, tree: dict[str, Any]) -> Any:
 # --- reading ---
 
 
-def _sent(f: Field, tree: dict[str, Any]) -> bool:
-    """False for a field that the sender's velod did not know yet; one that it must have sent is missed on reading."""
-    return not f.optional or f.name in tree
-
-
 def _value(s: Schema, f: Field, tree: dict[str, Any], sizes: dict[str, int]) -> Any:
-    """What was sent, or the default of what was not."""
-    if _sent(f, tree):
+    """What was sent, or the default where the sender's velod did not know the field yet; what it must have sent is
+    missed on reading.
+    """
+    if f.name in tree or not f.optional:
         return _READ[f.kind](s, f, tree, sizes)
-    if f.kind != "column":
-        return copy(f.default)
-    return np.full([part if isinstance(part, int) else sizes[part] for part in f.shape], f.default, f.dtype)
+    return np.full(_shape(f, sizes), f.default, f.dtype) if f.kind == "column" else copy(f.default)
+
+
+def _shape(f: Field, sizes: dict[str, int]) -> tuple[int, ...]:
+    return f.fixed_shape or tuple(part if isinstance(part, int) else sizes[part] for part in f.shape)
 
 
 def _read_int(s: Schema, f: Field, tree: dict[str, Any], sizes: dict[str, int]) -> int:
     value = _get(s, f.name, tree)
     if type(value) is not int:
         raise WireError("wire.field_type", f"{s.name}: {f.name} must be an integer, got {type(value).__name__}")
-    lo = _INT64[0] if f.min is None else f.min
-    hi = _INT64[1] if f.max is None else f.max
-    if not lo <= value <= hi:
-        raise WireError("wire.bounds", f"{s.name}: {f.name} = {value}, allowed {lo} .. {hi}")
+    if not f.lowest <= value <= f.highest:
+        raise WireError("wire.bounds", f"{s.name}: {f.name} = {value}, allowed {f.lowest} .. {f.highest}")
     return value
 
 
@@ -274,15 +270,15 @@ def _read_map(s: Schema, f: Field, tree: dict[str, Any], sizes: dict[str, int]) 
 def _read_column(s: Schema, f: Field, tree: dict[str, Any], sizes: dict[str, int]) -> NDArray[Any]:
     assert f.dtype is not None
     data = _bin(s, f, tree)
-    shape = tuple(part if isinstance(part, int) else sizes[part] for part in f.shape)
+    shape = _shape(f, sizes)
     _check_length(s, f, len(data), math.prod(shape) * f.dtype.itemsize)
     # A copy, because a view of the received bytes is read-only, which numba takes for another type of array.
-    return np.frombuffer(data, f.dtype).reshape(shape).astype(f.dtype.newbyteorder("="), copy=True)
+    return np.frombuffer(data, f.dtype).reshape(shape).astype(f.native)
 
 
 def _read_times(s: Schema, f: Field, tree: dict[str, Any], sizes: dict[str, int]) -> NDArray[np.int64]:
     # So that none of the times leaves the range.
-    base = _read_int(s, _int_field(f.base, _INT64[0], _INT64[1] - 2**32), tree, sizes)
+    base = _read_int(s, _int_field(f.base, INT64[0], INT64[1] - 2**32), tree, sizes)
     data = _bin(s, f, tree)
     _check_length(s, f, len(data), sizes[f.counts_rows] * f.row_bytes)
     times = np.frombuffer(data, OFFSET).astype(np.int64)
@@ -293,7 +289,7 @@ def _read_times(s: Schema, f: Field, tree: dict[str, Any], sizes: dict[str, int]
 @cache
 def _int_field(name: str, lo: int, hi: int) -> Field:
     """A number that is sent for a column's sake."""
-    return Field(name, "int", min=lo, max=hi)
+    return Field(name, "int", lowest=lo, highest=hi)
 
 
 def _check_length(s: Schema, f: Field, got: int, want: int) -> None:

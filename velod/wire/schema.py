@@ -16,6 +16,7 @@ from velod import types
 VERSION = 1
 OFFSET = np.dtype("<u4")
 """Of the column that times are sent as."""
+INT64 = (-(2**63), 2**63 - 1)
 MESSAGE_TYPES: dict[str, type[Any]] = {cls.__name__: cls for cls in get_args(types.Message)}
 
 
@@ -65,6 +66,10 @@ class Field:
     sent_as: str = ""  # name of what is sent: of the scalar, or of the column
     counts_rows: str = ""  # name of the dim that the column's length says, if it does
     row_bytes: int = 0  # of one row of the column
+    fixed_shape: tuple[int, ...] = ()  # of a column that always has the same
+    native: np.dtype[Any] | None = None  # of a column, in this machine's byte order
+    lowest: int = INT64[0]  # of an int
+    highest: int = INT64[1]
     promises: bool = False  # whether a decoder has to look at a column's values
 
 
@@ -107,11 +112,16 @@ def _field(tree: dict[str, Any], dims: dict[str, Dim]) -> Field:
 def _derived(f: Field, dims: dict[str, Dim]) -> Field:
     """The field with what follows from it."""
     rows = f.shape[0] if f.shape else 0
+    sizes = tuple(part for part in f.shape if isinstance(part, int))
     itemsize = OFFSET.itemsize if f.offsets else f.dtype.itemsize if f.dtype else 0
     return replace(
         f,
         sent_as=f.offsets or f.name,
         counts_rows=rows if isinstance(rows, str) and not dims[rows].sent else "",
         row_bytes=itemsize * math.prod(part for part in f.shape[1:] if isinstance(part, int)),
+        fixed_shape=sizes if len(sizes) == len(f.shape) else (),
+        native=f.dtype.newbyteorder("=") if f.dtype else None,
+        lowest=INT64[0] if f.min is None else f.min,
+        highest=INT64[1] if f.max is None else f.max,
         promises=any((f.finite, f.order, f.below)) or any(limit is not None for limit in (f.min, f.max, f.above)),
     )

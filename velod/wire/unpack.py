@@ -25,35 +25,36 @@ _NUMBERS = {
 _CONSTANTS = {0xC2: False, 0xC3: True}
 
 
-def unpack_views(data: bytes | bytearray | memoryview) -> dict[str, Any] | None:
+def unpack_views(data: bytes | bytearray) -> dict[str, Any] | None:
     """The map in ``data``, with a memoryview in place of each bin; None for anything but a whole map of short
     strings to plain values: that is for msgpack to read, or to refuse.
     """
     try:
-        return _read_map(memoryview(data))
+        return _read_map(data)
     except (IndexError, UnicodeDecodeError, error):
         return None
 
 
-def _read_map(view: memoryview) -> dict[str, Any] | None:
+def _read_map(data: bytes | bytearray) -> dict[str, Any] | None:
     tree: dict[str, Any] = {}
-    n, at = _map_header(view)
+    view = memoryview(data)
+    n, at = _map_header(data)
     for _ in range(n):
-        if not 0xA0 <= (first := view[at]) <= 0xBF:
+        if not 0xA0 <= (first := data[at]) <= 0xBF:
             return None
-        name = str(view[at + 1 : (at := at + first - 0x9F)], "utf-8")
-        first = view[at]
+        name = data[at + 1 : (at := at + first - 0x9F)].decode()
+        first = data[at]
         at += 1
         if first < 0x80:
             tree[name] = first
         elif layout := _BINS.get(first):
-            (length,) = layout.unpack_from(view, at)
+            (length,) = layout.unpack_from(data, at)
             tree[name] = view[at + layout.size : (at := at + layout.size + length)]
         elif layout := _NUMBERS.get(first):
-            (tree[name],) = layout.unpack_from(view, at)
+            (tree[name],) = layout.unpack_from(data, at)
             at += layout.size
         elif 0xA0 <= first <= 0xBF:
-            tree[name] = str(view[at : (at := at + first - 0xA0)], "utf-8")
+            tree[name] = data[at : (at := at + first - 0xA0)].decode()
         elif first >= 0xE0:
             tree[name] = first - 0x100
         elif first in _CONSTANTS:
@@ -61,11 +62,11 @@ def _read_map(view: memoryview) -> dict[str, Any] | None:
         else:
             return None
     # A slice that reaches beyond the end is short, and then so is the whole.
-    return tree if n and at == len(view) else None
+    return tree if n and at == len(data) else None
 
 
-def _map_header(view: memoryview) -> tuple[int, int]:
+def _map_header(data: bytes | bytearray) -> tuple[int, int]:
     """How many entries, and where they begin; no entries for what is no map of that many."""
-    if 0x80 <= view[0] <= 0x8F:
-        return view[0] - 0x80, 1
-    return (view[1] << 8 | view[2], 3) if view[0] == 0xDE else (0, 0)
+    if 0x80 <= data[0] <= 0x8F:
+        return data[0] - 0x80, 1
+    return (data[1] << 8 | data[2], 3) if data[0] == 0xDE else (0, 0)
