@@ -47,6 +47,7 @@ class IngestShell(WorkerShell):
     """Sensor packets in; IMU samples out to the optimizer, batches out to whichever worker is free."""
 
     inputs: ClassVar[dict[Topic, int]] = {EVENTS: 0, IMU_SENSOR: 0}
+    sends_large: ClassVar[bool] = True
 
     def __init__(
         self, session: zenoh.Session, settings: Settings, stage_name: str, worker: str, stage: Stage

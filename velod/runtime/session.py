@@ -30,6 +30,9 @@ __all__ = ["SessionError", "introducer_endpoint", "open_session"]
 
 CLIENT_WAIT_MS = 5000
 """So long may a client's first connection take."""
+SHARED_FROM_BYTES = 65_536
+"""Messages so large go through shared memory: events and batches, and no worker's results. Zenoh locks the pool of
+every process that sends one into the memory of all who receive it, and keeps it there when that process has died."""
 
 
 def open_session(settings: ZenohSettings, introducer: bool = False, rigs: Sequence[str] = ()) -> zenoh.Session:
@@ -218,7 +221,7 @@ def _transport(shared_memory: bool, lossless: bool) -> dict[str, Any]:
             "transport_optimization": {
                 "enabled": shared_memory,
                 "pool_size": 67108864,
-                "message_size_threshold": 16384,
+                "message_size_threshold": SHARED_FROM_BYTES,
                 "messages": ["put"],
             },
         },

@@ -46,6 +46,8 @@ class WorkerShell:
     """What the stage takes, and how far messages on one key may overtake each other; -1: do not look for gaps."""
     depth: ClassVar[int] = FIFO_DEPTH
     poll_s: ClassVar[float] = POLL_S
+    sends_large: ClassVar[bool] = False
+    """Whether what it publishes goes through shared memory."""
 
     def __init__(
         self, session: zenoh.Session, settings: Settings, stage_name: str, worker: str, stage: Stage
@@ -70,7 +72,8 @@ class WorkerShell:
             stack.enter_context(prime.listen(self.session, self.rig))
             self.subscribe(stack)
             self._wait_for_consumers(stop)
-            prime.prime(self.session, self.rig)
+            if self.sends_large:
+                prime.prime(self.session, self.rig)
             token = key(ALIVE, self.rig, stage=self.stage_name, worker=self.worker)
             stack.enter_context(self.session.liveliness().declare_token(token))
             log.info("up")

@@ -33,7 +33,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Wait, then be a worker; returns the exit code."""
     quietly(_import_all)
     from velod.runtime import worker
-    from velod.runtime.prime import prime
     from velod.runtime.session import open_session
     from velod.runtime.settings_service import fetch
     from velod.runtime.stages import stage_of
@@ -46,7 +45,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         stop = worker.stop_on_signals()
         with open_session(worker.zenoh_settings(args)) as session:
             settings, calibration = fetch(session, args.rig, args.connect)
-            prime(session, settings.rig.name)
             stages = quietly(lambda: _load(settings, calibration, args.stages.split(",")))
             print(READY, flush=True)
             name = _wait_for_order(stop)
