@@ -118,6 +118,12 @@ class IngestSettings:
         lo=0.0,
         hi=10_000.0,
     )
+    event_budget_ms: float = _f(
+        10.0,
+        "mode 'event', where budget_ms is not 0: likewise, while a packet or a slice waits for longer, ms",
+        lo=1.0,
+        hi=10_000.0,
+    )
     imu_frozen_samples: int = _f(50, "so many identical IMU samples in a row mean a frozen IMU", lo=3, hi=100_000)
 
 

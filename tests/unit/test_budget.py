@@ -8,7 +8,7 @@ import pytest
 from tests.moving_edges import T0_NS, calibration, edges, event_batches, settings
 from velod.ingest.budget import BAND_ROWS, LEAST_ROWS, Budget
 from velod.ingest.stage import IngestStage
-from velod.runtime.budget import GRACE_S, LEAST_SELECTION, MAX_WAITING, NO_PACKET, LoadShedder
+from velod.runtime.budget import EVENT_GRACE_S, GRACE_S, LEAST_SELECTION, MAX_WAITING, NO_PACKET, LoadShedder
 from velod.types import ImuSamples, StereoBatch
 
 TARGET_S = 0.05
@@ -57,6 +57,20 @@ def test_an_ingest_that_is_late_makes_fewer_batches_then_looks_at_fewer_rows() -
     for i in range(85, 325):
         assert load.takes_packet(0.0, 0.01 * i)
     assert load.budget() == Budget(room=MAX_WAITING)
+
+
+def test_event_by_event_packets_and_slices_may_wait_for_their_own_target() -> None:
+    load = LoadShedder(TARGET_S, 0.2 * TARGET_S)
+    assert load.takes_packet(0.2 * NO_PACKET * TARGET_S - 1e-3, 0.0)
+    assert not load.takes_packet(0.2 * NO_PACKET * TARGET_S + 1e-3, 0.0)
+    load.note_slices(0.0, 1, 0.0)
+    assert not load.budget().slices
+    load.note_slices(0.0, 0, 0.0)
+    assert load.budget() == Budget(room=MAX_WAITING)
+    for i in range(round(EVENT_GRACE_S / 0.01) + 6):
+        load.note_workers(0.3 * TARGET_S, 0, 0.01 * i)
+        load.note_slices(0.3 * TARGET_S, 0, 0.01 * i)
+    assert LEAST_SELECTION < load.budget().selection < 0.6
 
 
 def test_batches_are_made_only_while_there_is_room_to_wait() -> None:

@@ -139,6 +139,20 @@ def test_what_was_selected_of_a_batch_that_the_budget_forbids_belongs_to_the_nex
         assert np.array_equal(columns[0], columns[1][: len(columns[0])])
 
 
+def test_while_slices_wait_the_same_events_go_out_at_the_end_of_their_batch() -> None:
+    e = edges(seconds=0.1)
+    usual, held = stage(count=10**6), stage(count=10**6)
+    held.budget = Budget(slices=False)
+    by_slice, at_once = (by_batch(run(e, T0_NS + 100 * MS, ingest)) for ingest in (usual, held))
+    assert max(len(parts) for _, parts in by_slice) > 3
+    assert [len(parts) for _, parts in at_once] == [1] * len(by_slice)
+    for (stereo, parts), (same, (whole,)) in zip(by_slice, at_once, strict=True):
+        assert np.array_equal(stereo.x, same.x)
+        for name in ("x", "y", "p"):
+            assert np.array_equal(np.concatenate([getattr(q, name) for q in parts]), getattr(whole, name))
+        assert whole.t_ns == stereo.t_ns
+
+
 def test_a_smaller_budget_selects_fewer_events() -> None:
     e = edges()
     full, half = stage(), stage()

@@ -22,6 +22,7 @@ class Budget:
     rows: float = 1.0  # share of the sensor's rows whose events are looked at
     batches: float = 1.0  # share of the batches that are made, evenly spread
     room: int = sys.maxsize  # so many more may be made; those beyond are not
+    slices: bool = True  # event by event: what is selected may go out before its batch ends
 
     def quota(self, full: int) -> int:
         """Events that a batch may select, at least 1."""

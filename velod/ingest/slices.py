@@ -14,6 +14,7 @@ from velod.events.plane_fit import SIZE, WIDE_SIZE
 from velod.events.sae import new_surface
 from velod.events.selection import cell_side_px
 from velod.ingest.batch import OpenBatch
+from velod.ingest.budget import Budget
 from velod.ingest.stream import CameraStream
 from velod.types import RING, U8, U16, U32, EventBatch
 
@@ -62,14 +63,15 @@ class Slices:
         return self._sent > 0
 
     def advance(
-        self, left: CameraStream, batch: OpenBatch, batch_seq: int, horizon_ns: int, rest: float = 1.0
+        self, left: CameraStream, batch: OpenBatch, batch_seq: int, horizon_ns: int, budget: Budget
     ) -> list[EventBatch]:
         """Enter the left events before ``horizon_ns``, all of them of ``batch``; returns the slices that are over.
 
-        Cells rest ``rest`` times as long as the settings say.
+        With a share of the selection cells rest longer, and without ``budget.slices`` what is selected waits for a
+        later slice, at the latest that at the batch's end.
         """
         out: list[EventBatch] = []
-        rest_ns = round(self._settings.ingest.rest_ms * 1e6 * rest)
+        rest_ns = round(self._settings.ingest.rest_ms * 1e6 / budget.selection)
         while True:
             if self._end_ns is None:
                 queued_t_ns = left.queue.peek()[2]
@@ -79,7 +81,8 @@ class Slices:
             self._enter(left, batch, min(self._end_ns, horizon_ns), rest_ns)
             if horizon_ns < self._end_ns:
                 break
-            out += self._cut(batch, batch_seq, self._end_ns)
+            if budget.slices:
+                out += self._cut(batch, batch_seq, self._end_ns)
             self._end_ns = None
         if horizon_ns == batch.t_end_ns:
             out += self._cut(batch, batch_seq, horizon_ns)

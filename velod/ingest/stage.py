@@ -138,8 +138,7 @@ class IngestStage:
         if self._slices is None:
             self._open.fill(self._left.enter_before(horizon_ns))
             return []
-        rest = 1.0 / self.budget.selection
-        return [*self._slices.advance(self._left, self._open, self._batch_seq + 1, horizon_ns, rest)]
+        return [*self._slices.advance(self._left, self._open, self._batch_seq + 1, horizon_ns, self.budget)]
 
     def _is_complete(self, t_end_ns: int) -> bool:
         """Whether all events before ``t_end_ns`` are known, or will not be waited for."""

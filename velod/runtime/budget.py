@@ -17,6 +17,8 @@ FALL = 0.8
 """A share is multiplied by this while something is late, once in the time that is late."""
 GRACE_S = 0.25
 """It falls only after so long without a moment in time: a process that starts beside velod is no overload."""
+EVENT_GRACE_S = 0.05
+"""Likewise event by event, where latency comes first."""
 RISE_PER_S = 0.5
 """A share grows by so much in a second while nothing is."""
 CALM = 0.5
@@ -42,6 +44,7 @@ class Share:
 
     target_s: float
     least: float
+    grace_s: float = GRACE_S
     value: float = 1.0
     _last_s: float = math.inf
     _late_s: float = math.inf  # since when there has been delay
@@ -53,7 +56,7 @@ class Share:
         self._last_s = now_s
         self._late_s = min(self._late_s, now_s) if delay_s > self.target_s else math.inf
         if delay_s > self.target_s:
-            if now_s >= max(self._patience_s, self._late_s + GRACE_S):
+            if now_s >= max(self._patience_s, self._late_s + self.grace_s):
                 self.value = max(self.least, self.value * FALL)
                 self._patience_s = now_s + self.target_s
         elif delay_s < CALM * self.target_s:
@@ -62,14 +65,20 @@ class Share:
 
 @dataclass(slots=True)
 class LoadShedder:
-    """Ingest's budget. ``target_s`` 0: nothing is ever shed."""
+    """Ingest's budget. ``target_s`` 0: nothing is ever shed.
+
+    ``event_target_s``: of packets and slices, where events are selected one by one; 0: they are not.
+    """
 
     target_s: float
+    event_target_s: float = 0.0
     counters: dict[str, int] = field(default_factory=dict)
     _selection: Share = field(init=False)
+    _slices: Share = field(init=False)
     _batches: Share = field(init=False)
     _rows: Share = field(init=False)
     _room: int = MAX_WAITING
+    _cuts: bool = True
     _dropping: bool = False
     _shed: int = 0  # batches, when the last period ended
     _made: int = 0  # batches of this period, and how much of the quota they had
@@ -80,13 +89,27 @@ class LoadShedder:
 
     def __post_init__(self) -> None:
         self._selection = Share(self.target_s, LEAST_SELECTION)
-        self._batches = Share(self.target_s, LEAST_BATCHES)
-        self._rows = Share(FEWER_ROWS * self.target_s, LEAST_ROWS / BAND_ROWS)
+        self._slices = Share(self.event_target_s, LEAST_SELECTION, EVENT_GRACE_S)
+        by_event = self.event_target_s > 0.0
+        grace_s = EVENT_GRACE_S if by_event else GRACE_S
+        self._batches = Share(self._packet_s, LEAST_BATCHES, grace_s)
+        # Event by event a packet is late at once, and rows are what most of the work goes with.
+        targets = 1.0 if by_event else FEWER_ROWS
+        self._rows = Share(targets * self._packet_s, LEAST_ROWS / BAND_ROWS, grace_s)
+
+    @property
+    def _packet_s(self) -> float:
+        return self.event_target_s or self.target_s
 
     def note_workers(self, delay_s: float, waiting: int, now_s: float) -> None:
         """What a new batch has to wait for has been there for ``delay_s``; ``waiting`` batches have not been sent."""
         self._selection.note(delay_s, now_s)
         self._room = 0 if delay_s > NO_BATCH * self.target_s else max(0, MAX_WAITING - waiting)
+
+    def note_slices(self, delay_s: float, waiting: int, now_s: float) -> None:
+        """Event by event: as ``note_workers``, of a new slice. While one waits, what is selected joins the next."""
+        self._slices.note(delay_s, now_s)
+        self._cuts = waiting == 0
 
     def takes_packet(self, waited_s: float, now_s: float) -> bool:
         """Whether an event packet that has waited for so long is to be looked at; else it is counted and dropped."""
@@ -94,7 +117,7 @@ class LoadShedder:
             return True
         self._batches.note(waited_s, now_s)
         self._rows.note(waited_s, now_s)
-        self._dropping = waited_s > (PACKETS_AGAIN if self._dropping else NO_PACKET) * self.target_s
+        self._dropping = waited_s > (PACKETS_AGAIN if self._dropping else NO_PACKET) * self._packet_s
         if self._dropping:
             self.counters["shed.packets"] = self.counters.get("shed.packets", 0) + 1
         self._packets += 1
@@ -105,12 +128,16 @@ class LoadShedder:
         """What may be taken on now."""
         if not self.target_s:
             return Budget()
-        return Budget(self._selection.value, self._rows.value, self._batches.value, self._room)
+        return Budget(self._share, self._rows.value, self._batches.value, self._room, self._cuts)
+
+    @property
+    def _share(self) -> float:
+        return min(self._selection.value, self._slices.value)
 
     def note_batch(self) -> None:
         """A batch was made within the budget."""
         self._made += 1
-        self._selected += self._selection.value if self.target_s else 1.0
+        self._selected += self._share if self.target_s else 1.0
 
     def end_period(self, counters: Mapping[str, int]) -> None:
         """A period of health ends, with these counters of ingest; ``shares`` and ``alarms`` now speak of it."""

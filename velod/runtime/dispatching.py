@@ -66,10 +66,10 @@ class BatchDispatch:
         for stage, dispatcher in self._dispatchers.items():
             self._put(stage, dispatcher.expire(time.monotonic()))
 
-    def load(self) -> tuple[float, int]:
-        """Of the busier stage: how long a new batch's predecessors have been there, s, and how many wait."""
-        now_s, stages = time.monotonic(), self._dispatchers.values()
-        return max(d.delay_s(now_s) for d in stages), max(len(d.waiting) for d in stages)
+    def load(self, *stages: str) -> tuple[float, int]:
+        """Of the busiest of ``stages``: how long a new batch's predecessors have been there, s, and how many wait."""
+        now_s, dispatchers = time.monotonic(), [self._dispatchers[stage] for stage in stages]
+        return max(d.delay_s(now_s) for d in dispatchers), max(len(d.waiting) for d in dispatchers)
 
     def counters(self) -> dict[str, int]:
         """Counters of both dispatchers, ``dispatch.overflow.flow`` and so on, and of each worker, ``sent.flow-0``."""

@@ -56,7 +56,9 @@ class IngestShell(WorkerShell):
         self._sensor_clock = SensorClockFit()
         self._dispatch = BatchDispatch(self.outlet, settings.zenoh.lossless)
         # A lossless replay waits for the slowest instead.
-        self._load = LoadShedder(0.0 if settings.zenoh.lossless else 1e-3 * settings.ingest.budget_ms)
+        s, self._by_event = settings.ingest, settings.ingest.mode == "event"
+        targets_s = (1e-3 * s.budget_ms, 1e-3 * s.event_budget_ms if self._by_event else 0.0)
+        self._load = LoadShedder(*(0.0, 0.0) if settings.zenoh.lossless else targets_s)
 
     def subscribe(self, stack: ExitStack) -> None:
         """The sensor, answers of workers, and their coming and going."""
@@ -76,7 +78,11 @@ class IngestShell(WorkerShell):
         now_s = time.monotonic()
         if not self._load.takes_packet((time.time_ns() - item.t_ns) * 1e-9, now_s):
             return True
-        self._load.note_workers(*self._dispatch.load(), now_s)
+        if self._by_event:
+            self._load.note_slices(*self._dispatch.load("flow"), now_s)
+            self._load.note_workers(*self._dispatch.load("depth"), now_s)
+        else:
+            self._load.note_workers(*self._dispatch.load("flow", "depth"), now_s)
         if isinstance(self.stage, Limited):
             self.stage.budget = self._load.budget()
         return False
