@@ -91,6 +91,7 @@ class EventBatch:
     first: int = 0  # position there of the first event
     ring: U32 = field(default_factory=lambda: np.empty((0, RING), np.uint32))
     """(n, 24) likewise the rest of the 7x7, row-major without the 5x5; (0, 24): not known, or not wanted"""
+    time_noise_ns: int = 0  # standard deviation of the time stamps' errors, as far as known
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,6 +113,7 @@ class StereoBatch:
     right: U16  # (2, h, w) right sensor grid
     left_last: U16  # (h, w) last event of either polarity, left
     right_last: U16  # (h, w) right
+    time_noise_ns: int = 0  # standard deviation of the time stamps' errors, as far as known
 
 
 @dataclass(frozen=True, slots=True)

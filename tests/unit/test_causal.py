@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 
 from tests.moving_edges import HEIGHT, T0_NS, WIDTH, Events, edges
 from velod.events.causal import all_open, enter_and_select, split_ages
-from velod.events.plane_fit import fit_plane
+from velod.events.plane_fit import NOISE_RMS2, fit_plane
 from velod.events.sae import NEVER, new_surface, update_sae
-from velod.events.selection import GOOD, MAX_ASYMMETRY
+from velod.events.selection import GOOD, MAX_ASYMMETRY, SYMMETRY_NOISE
 
 MS = 1_000_000
 MEMORY, REFRACTORY, CELL_PX, BORDER = 100 * MS, 10 * MS, 7, 5
@@ -34,14 +34,14 @@ class Selected:
         return self.stamps.max(axis=1)
 
 
-def selected(events: Events, rest_ns: int = 0, capacity: int = 20_000) -> Selected:
+def selected(events: Events, rest_ns: int = 0, capacity: int = 20_000, time_noise_s: float = 0.0) -> Selected:
     first, last, taken = (new_surface(HEIGHT, WIDTH) for _ in range(3))
     rows, columns = np.arange(HEIGHT) // CELL_PX, np.arange(WIDTH) // CELL_PX
     at, stamps = np.empty((capacity, 3), np.int32), np.empty((capacity, 49), np.int64)
     n = enter_and_select(
         events.x, events.y, events.t_ns, events.p, first, last, REFRACTORY,
         taken, all_open(rows[-1] + 1, columns[-1] + 1), rows, columns, rest_ns, BORDER,
-        MEMORY, 1.0, 2, 20, 0.35, at, stamps, 0,
+        MEMORY, 1.0, 2, 20, 0.35, time_noise_s, at, stamps, 0,
     )  # fmt: skip
     same_first, same_last = new_surface(HEIGHT, WIDTH), new_surface(HEIGHT, WIDTH)
     update_sae(events.x, events.y, events.t_ns, events.p, same_first, same_last, REFRACTORY)
@@ -49,7 +49,7 @@ def selected(events: Events, rest_ns: int = 0, capacity: int = 20_000) -> Select
     return Selected(at[:n], stamps[:n])
 
 
-def twin(events: Events, rest_ns: int) -> Selected:
+def twin(events: Events, rest_ns: int, time_noise_s: float) -> Selected:
     """The rule as it reads, with dictionaries for the surfaces."""
     first: dict[tuple[int, int, int], int] = {}
     last: dict[tuple[int, int, int], int] = {}
@@ -73,13 +73,14 @@ def twin(events: Events, rest_ns: int) -> Selected:
                 continue
             offset = {d: a - (t - middle) for d, a in ring.items()}
             halves = [(offset[d], offset[-d[0], -d[1]]) for d in RING[:4]]
-            if sum(abs(a + b) for a, b in halves) > MAX_ASYMMETRY * sum(abs(a - b) for a, b in halves):
+            slack_ns = SYMMETRY_NOISE * time_noise_s * 1e9
+            if sum(abs(a + b) for a, b in halves) > MAX_ASYMMETRY * sum(abs(a - b) for a, b in halves) + slack_ns:
                 continue
             patch = [first.get((p, r + i, c + j), NEVER) for i in range(-2, 3) for j in range(-2, 3)]
             age = np.array([(t + 1 - s) * 1e-9 if t + 1 - s <= MEMORY else 0.0 for s in patch])
-            n, gx, gy, _, rms, *_ = fit_plane(age, 1.0, 2, 20)
+            n, gx, gy, _, rms, *_ = fit_plane(age, 1.0, 2, 20, time_noise_s)
             gate = 0.35 if t >= opens.get(cell, NEVER) + rest_ns else GOOD * 0.35
-            if n and rms < gate * math.hypot(gx, gy):
+            if n and math.sqrt(max(rms**2 - NOISE_RMS2 * time_noise_s**2, 0.0)) < gate * math.hypot(gx, gy):
                 at.append((p, r, c))
                 stamps.append([first.get((p, r + i, c + j), NEVER) for i in range(-3, 4) for j in range(-3, 4)])
                 taken[p, r, c], opens[cell] = middle, t + rest_ns
@@ -98,8 +99,9 @@ def noisy(jitter_ns: int, seed: int = 1, **how: Any) -> Events:
 def test_the_kernel_selects_what_its_plain_twin_does() -> None:
     for angle in (0.0, 0.9, 2.5, -1.2):
         events = noisy(jitter_ns=300_000, angle=angle, seconds=0.06)
-        for rest_ns in (0, 5 * MS):
-            ours, plain = selected(events, rest_ns), twin(events, rest_ns)
+        for rest_ns, time_noise_s in ((0, 0.0), (5 * MS, 0.0), (5 * MS, 1e-4)):
+            ours = selected(events, rest_ns, time_noise_s=time_noise_s)
+            plain = twin(events, rest_ns, time_noise_s)
             assert len(ours.at) > 50
             assert np.array_equal(ours.at, plain.at) and np.array_equal(ours.stamps, plain.stamps)
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from tests.moving_edges import HEIGHT, T0_NS, WIDTH, Events, edges
-from velod.events.plane_fit import fit_plane
+from velod.events.plane_fit import NOISE_RMS2, fit_plane
 from velod.events.sae import NEVER, encode_ages, new_surface, update_sae
-from velod.events.selection import MAX_ASYMMETRY, select_burst, select_paper
+from velod.events.selection import MAX_ASYMMETRY, SYMMETRY_NOISE, select_burst, select_paper
 
 MS = 1_000_000
 MEMORY = 100 * MS
@@ -129,7 +129,7 @@ def test_an_empty_surface_gives_nothing() -> None:
 
 
 def burst_twin(
-    first: np.ndarray, t_end: int, completed_from: int, completed_to: int, reach: int
+    first: np.ndarray, t_end: int, completed_from: int, completed_to: int, reach: int, time_noise_s: float
 ) -> set[tuple[int, int, int]]:
     """The rule for bursts, pixel by pixel, on times that are not encoded, for neighbours ``reach`` px away."""
     oldest, kept = t_end - MEMORY, set()
@@ -143,14 +143,17 @@ def burst_twin(
         pairs = [(outer[i] - outer[4], outer[8 - i] - outer[4]) for i in range(4)]
         symmetric, antisymmetric = sum(abs(a + b) for a, b in pairs), sum(abs(a - b) for a, b in pairs)
         completed = completed_from <= np.delete(outer, 4).max() < completed_to
-        n, gx, gy, _, rms, *_ = fit_plane(np.where(patch > oldest, t_end - patch, 0) * 1e-9, 1.0, 2, 20)
-        if completed and symmetric <= MAX_ASYMMETRY * antisymmetric and n and rms < 0.35 * np.hypot(gx, gy):
+        n, gx, gy, _, rms, *_ = fit_plane(np.where(patch > oldest, t_end - patch, 0) * 1e-9, 1.0, 2, 20, time_noise_s)
+        is_plane = symmetric <= MAX_ASYMMETRY * antisymmetric + SYMMETRY_NOISE * time_noise_s * 1e9
+        own2 = max(rms**2 - NOISE_RMS2 * time_noise_s**2, 0.0)
+        if completed and is_plane and n and own2 < 0.35**2 * (gx**2 + gy**2):
             kept.add((x, y, p))
     return kept
 
 
+@pytest.mark.parametrize("time_noise_s", [0.0, 3e-4])
 @pytest.mark.parametrize("seed", range(3))
-def test_with_room_for_all_selection_is_what_its_plain_twin_says(seed: int) -> None:
+def test_with_room_for_all_selection_is_what_its_plain_twin_says(seed: int, time_noise_s: float) -> None:
     events = edges(speed=300.0, angle=0.6 + seed)
     rng = np.random.default_rng(seed)
     kept = events[rng.random(len(events.x)) < 0.9]
@@ -158,10 +161,10 @@ def test_with_room_for_all_selection_is_what_its_plain_twin_says(seed: int) -> N
     first += rng.integers(-MS, MS, first.shape)
     t_start, t_end = T0_NS + 70 * MS, T0_NS + 95 * MS
     first[first >= t_end] = NEVER
-    x, y, p = burst(first, t_start, t_end, quota=5000)
+    x, y, p = burst(first, t_start, t_end, quota=5000, time_noise_s=time_noise_s)
     got = set(zip(x.tolist(), y.tolist(), p.tolist(), strict=True))
-    wide = burst_twin(first, t_end, t_start, t_end, 3)
-    twin = wide | burst_twin(first, t_end, 2 * t_start - t_end, t_start, 2)
+    wide = burst_twin(first, t_end, t_start, t_end, 3, time_noise_s)
+    twin = wide | burst_twin(first, t_end, 2 * t_start - t_end, t_start, 2, time_noise_s)
     # Encoding rounds times to 1.5 us: events within that of a limit may fall on its other side.
     assert len(got ^ twin) <= 0.01 * len(twin)
     assert len(wide) > 100 and len(twin - wide) > 5

@@ -13,7 +13,17 @@ import numpy as np
 from numba import njit
 
 from velod.events.columns import readonly
-from velod.events.plane_fit import INNER_AT, REACH, SIZE, WIDE_SIZE, PlaneFit, fit_plane, honest_rms, widen_plane
+from velod.events.plane_fit import (
+    INNER_AT,
+    REACH,
+    SIZE,
+    WIDE_SIZE,
+    PlaneFit,
+    fit_plane,
+    honest_rms,
+    rms_px,
+    widen_plane,
+)
 from velod.geometry.rectify import Rectification
 from velod.types import F32, F64, I64, NS_PER_S, U8, U16, WIDE
 
@@ -30,6 +40,8 @@ _MAX_SHIFT_PX = 1.5
 _MAX_SLOPE_DIFFERENCE = 0.3
 _MAX_RMS_PX = 0.35
 _MAX_STEPS = 2
+# So much of the time stamps' noise, per px, may slopes differ beside that share: on average it is 0.1 of it.
+_SLOPE_NOISE = 0.5
 # Edges flatter than this slide along the row: their place on it is not observed.
 MIN_NORMAL_X = 0.15
 
@@ -70,10 +82,12 @@ def refine(
     p: U8,
     seed_px: F32,
     rectification: Rectification,
+    time_noise_s: float = 0.0,
 ) -> Refined:
     """Refine the disparities ``seed_px`` (n,) (NaN: none) of events at sensor pixels x, y with polarity p.
 
-    ``left`` and ``right`` (2, h, w) are first-of-burst surfaces on the sensor grids, ages in steps of ``unit_ns``.
+    ``left`` and ``right`` (2, h, w) are first-of-burst surfaces on the sensor grids, ages in steps of ``unit_ns``;
+    time stamps have an error of ``time_noise_s``.
     """
     n = x.shape[0]
     out = Refined(np.empty(n, np.uint8), np.empty(n), np.empty(n), np.empty(n))
@@ -90,6 +104,7 @@ def refine(
         rectification.right_covector,
         rectification.remap_right[0],
         rectification.remap_right[1],
+        time_noise_s,
         np.empty(WIDE_SIZE + SIZE),
         out.outcome,
         out.disparity,
@@ -100,7 +115,9 @@ def refine(
 
 
 @njit(cache=True, nogil=True)
-def _plane(surface: U16, p: int, x: int, y: int, unit_s: float, min_neighbours: int, age: F64) -> PlaneFit:
+def _plane(
+    surface: U16, p: int, x: int, y: int, unit_s: float, min_neighbours: int, time_noise_s: float, age: F64
+) -> PlaneFit:
     """The widened plane at (x, y), none as of ``fit_plane`` where its neighbours leave the sensor; ``age``: room."""
     if x < REACH or x >= surface.shape[2] - REACH or y < REACH or y >= surface.shape[1] - REACH:
         return 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -111,8 +128,8 @@ def _plane(surface: U16, p: int, x: int, y: int, unit_s: float, min_neighbours: 
             wide[i * WIDE + j] = row[j] * unit_s
     for i in range(SIZE):
         inner[i] = wide[INNER_AT[i]]
-    fit = fit_plane(inner, _REJECT_PX, _REJECTIONS, min_neighbours)
-    return widen_plane(fit, wide, _REJECT_PX, _MAX_RMS_PX)[0] if fit[0] > 0 else fit
+    fit = fit_plane(inner, _REJECT_PX, _REJECTIONS, min_neighbours, time_noise_s)
+    return widen_plane(fit, wide, _REJECT_PX, _MAX_RMS_PX, time_noise_s)[0] if fit[0] > 0 else fit
 
 
 @njit(cache=True, nogil=True)
@@ -143,6 +160,7 @@ def _refine_one(
     right_covector: F32,
     map_x: F32,
     map_y: F32,
+    time_noise_s: float,
     age: F64,
 ) -> tuple[int, float, float]:
     """(outcome, disparity, its sigma) from the left plane's time, the variance of that, and rectified slope."""
@@ -153,7 +171,9 @@ def _refine_one(
         if not (math.isfinite(sensor_x) and math.isfinite(sensor_y)):
             return NO_RIGHT_PLANE, math.nan, math.nan
         px, py = round(sensor_x), round(sensor_y)
-        n, gx, gy, t0, rms, _qxx, _qxy, _qyy = _plane(right, p, px, py, unit_s, _MIN_NEIGHBOURS_RIGHT, age)
+        n, gx, gy, t0, rms, _qxx, _qxy, _qyy = _plane(
+            right, p, px, py, unit_s, _MIN_NEIGHBOURS_RIGHT, time_noise_s, age
+        )
         if n == 0:
             return NO_RIGHT_PLANE, math.nan, math.nan
         M = right_covector[py, px]
@@ -169,11 +189,11 @@ def _refine_one(
             slope = math.sqrt(gx_left * gx_left + gy_left * gy_left)
             difference = math.sqrt((gx_right - gx_left) ** 2 + (gy_right - gy_left) ** 2)
             norm = math.sqrt(gx * gx + gy * gy)
-            if difference > _MAX_SLOPE_DIFFERENCE * slope:
+            if difference > math.hypot(_MAX_SLOPE_DIFFERENCE * slope, _SLOPE_NOISE * time_noise_s):
                 return SLOPES, math.nan, math.nan
-            if rms > _MAX_RMS_PX * norm:
+            if rms_px(rms, norm * norm, time_noise_s) > _MAX_RMS_PX:
                 return RESIDUAL, math.nan, math.nan
-            variance = variance_left + honest_rms(n, rms, norm) ** 2 / n
+            variance = variance_left + honest_rms(n, rms, norm, time_noise_s) ** 2 / n
             return REFINED, x_left - x, INFLATION * math.sqrt(variance) / abs(gx_right)
     return FAR, math.nan, math.nan
 
@@ -192,6 +212,7 @@ def _refine(
     right_covector: F32,
     map_x: F32,
     map_y: F32,
+    time_noise_s: float,
     age: F64,
     outcome: U8,
     disparity: F64,
@@ -204,7 +225,9 @@ def _refine(
         normal_x[k] = math.nan
         sigma_px[k] = math.nan
         outcome[k] = NO_LEFT_PLANE
-        n, gx, gy, t_left, rms, _qxx, _qxy, _qyy = _plane(left, pk, xk, yk, unit_s, _MIN_NEIGHBOURS, age)
+        n, gx, gy, t_left, rms, _qxx, _qxy, _qyy = _plane(
+            left, pk, xk, yk, unit_s, _MIN_NEIGHBOURS, time_noise_s, age
+        )
         if n == 0:
             continue
         M = left_covector[yk, xk]
@@ -228,11 +251,12 @@ def _refine(
             float(left_xy[yk, xk, 1]),
             float(seed[k]),
             t_left,
-            honest_rms(n, rms, math.sqrt(gx * gx + gy * gy)) ** 2 / n,
+            honest_rms(n, rms, math.sqrt(gx * gx + gy * gy), time_noise_s) ** 2 / n,
             gx_left,
             gy_left,
             right_covector,
             map_x,
             map_y,
+            time_noise_s,
             age,
         )

@@ -109,6 +109,7 @@ class DepthStage:
             message.p,
             seed,
             self._rectification,
+            1e-9 * message.time_noise_ns,
         )
         count = np.bincount(refined.outcome, minlength=len(OUTCOMES))
         for number, name in enumerate(OUTCOMES):
@@ -161,6 +162,7 @@ class DepthStage:
             message.p[at],
             matches.rival[at],
             self._rectification,
+            1e-9 * message.time_noise_ns,
         )
         out = np.zeros_like(among)
         out[at] = (second.outcome == REFINED) & (np.abs(second.disparity - disparity[at]) > _RIVAL_PX)

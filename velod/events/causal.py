@@ -8,15 +8,13 @@ bounds the rate.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from velod.events.plane_fit import HALF, INNER_AT, REACH, RING_AT, SIZE, WIDE_SIZE, fit_plane
+from velod.events.plane_fit import HALF, INNER_AT, REACH, RING_AT, SIZE, WIDE_SIZE, fit_plane, rms_px
 from velod.events.sae import NEVER, enter_last
-from velod.events.selection import GOOD, MAX_ASYMMETRY
+from velod.events.selection import GOOD, MAX_ASYMMETRY, SYMMETRY_NOISE
 from velod.types import I64, PATCH, RING, U8, U16, U32, WIDE
 
 I32 = NDArray[np.int32]
@@ -42,6 +40,7 @@ def enter_and_select(
     rejections: int,
     min_neighbours: int,
     max_rms_px: float,
+    time_noise_s: float,
     at: I32,
     stamps: I64,
     n: int,
@@ -79,16 +78,17 @@ def enter_and_select(
                 due = (t - middle <= memory_ns // 2) & (first[k, rm - dr, cm - dc] <= middle)
                 if not (due & (middle != taken[k, rm, cm])):
                     continue
-                if not _symmetric(first[k], rm, cm, t, memory_ns):
+                if not _symmetric(first[k], rm, cm, t, memory_ns, SYMMETRY_NOISE * time_noise_s * 1e9):
                     continue
                 for q in range(SIZE):
                     # The age of the arriving event is 1 ns: 0 is a missing one.
                     a = t + 1 - first[k, rm - HALF + q // PATCH, cm - HALF + q % PATCH]
                     age[q] = a * 1e-9 if a <= memory_ns else 0.0
-                left, gx, gy, _, rms, _, _, _ = fit_plane(age, reject_px, rejections, min_neighbours)
+                left, gx, gy, _, rms, _, _, _ = fit_plane(age, reject_px, rejections, min_neighbours, time_noise_s)
                 # A cell that has waited for another rest takes what is merely acceptable.
                 waited = t >= opens[column_cell[cm]] + rest_ns
-                if left == 0 or not rms < (1.0 if waited else GOOD) * max_rms_px * math.hypot(gx, gy):
+                residual_px = rms_px(rms, gx * gx + gy * gy, time_noise_s)
+                if left == 0 or not residual_px < (1.0 if waited else GOOD) * max_rms_px:
                     continue
                 at[n, 0], at[n, 1], at[n, 2] = k, rm, cm
                 for q in range(WIDE_SIZE):
@@ -100,8 +100,11 @@ def enter_and_select(
 
 
 @njit(cache=True, nogil=True)
-def _symmetric(surface: I64, r: int, c: int, t: int, memory_ns: int) -> bool:
-    """Whether opposite outer neighbours lie symmetrically about (r, c) in time, as on a plane; none: oldest."""
+def _symmetric(surface: I64, r: int, c: int, t: int, memory_ns: int, slack_ns: float) -> bool:
+    """Whether opposite outer neighbours lie symmetrically about (r, c) in time, as on a plane; none: oldest.
+
+    ``slack_ns`` of asymmetry is allowed in any case.
+    """
     middle = min(t - surface[r, c], memory_ns)
     symmetric = antisymmetric = 0
     for j in range(4):
@@ -110,7 +113,7 @@ def _symmetric(surface: I64, r: int, c: int, t: int, memory_ns: int) -> bool:
         b = min(t - surface[r - dr, c - dc], memory_ns) - middle
         symmetric += abs(a + b)
         antisymmetric += abs(a - b)
-    return symmetric <= MAX_ASYMMETRY * antisymmetric
+    return symmetric <= MAX_ASYMMETRY * antisymmetric + slack_ns
 
 
 def all_open(rows: int, columns: int) -> I64:

@@ -33,6 +33,12 @@ MIN_DETERMINANT = 1e-3
 USUAL_RMS_PX, USUAL_WEIGHT = 0.15, 10.0
 """The residual that fits usually have, px, and as how many neighbours it counts: a residual far below it is luck."""
 
+NOISE_REACH = 2.5
+"""So many standard deviations of its time stamp may a neighbour be off beside the limit in px."""
+NOISE_RMS2 = 1.3
+"""So many variances of the time stamps may a fit's mean square residual hold beside the gate in px: that of 25
+neighbours scatters by 0.3."""
+
 PlaneFit = tuple[int, float, float, float, float, float, float, float]
 """(n, gx, gy, t0, rms, qxx, qxy, qyy): see ``fit_plane``."""
 
@@ -68,13 +74,32 @@ def _moments(kept: np.int64) -> tuple[float, float, float, float, float, float]:
     return n, x, y, xx, xy, yy
 
 
+@njit(cache=True, nogil=True)
+def rms_px(rms: float, slope2: float, time_noise_s: float) -> float:
+    """Residual of a plane in px, less what time stamps with that error account for; inf without a slope.
+
+    A gate on the residual as it is would let pass, of fast edges, those fits whose slope came out too large.
+    """
+    left = max(rms * rms - NOISE_RMS2 * time_noise_s * time_noise_s, 0.0)
+    return math.sqrt(left / slope2) if slope2 > 0.0 else math.inf
+
+
+@njit(cache=True, nogil=True)
+def _reach_s(limit_px: float, slope2: float, time_noise_s: float) -> float:
+    """How far from a plane a neighbour may be, s."""
+    return math.sqrt(limit_px * limit_px * slope2 + NOISE_REACH * NOISE_REACH * time_noise_s * time_noise_s)
+
+
 @njit(fastmath=ANY_ORDER, cache=True, nogil=True, error_model="numpy")
-def fit_plane(age: F64, reject_px: float, rejections: int, min_neighbours: int) -> PlaneFit:
+def fit_plane(
+    age: F64, reject_px: float, rejections: int, min_neighbours: int, time_noise_s: float = 0.0
+) -> PlaneFit:
     """Least-squares plane t = gx dx + gy dy + t0 through the neighbours, outliers rejected.
 
     ``age``: (25,) float64, row-major 5x5 patch, seconds before the batch's end; <= 0 marks a missing neighbour.
     The time fitted is t = -age and dx, dy = -2..2 px count from the centre. Each of up to ``rejections`` rounds
-    drops the neighbours whose residual exceeds ``reject_px`` times the slope's norm, then fits again.
+    drops the neighbours whose residual exceeds ``reject_px`` times the slope's norm and, in quadrature, what time
+    stamps with an error of ``time_noise_s`` account for, then fits again.
 
     Returns (n, gx, gy, t0, rms, qxx, qxy, qyy): neighbours left, slope in s/px, time of the plane at the centre
     in s (<= 0: before the batch's end), rms residual in s, and the slope's cofactor matrix Q in 1/px^2, so that
@@ -108,7 +133,7 @@ def fit_plane(age: F64, reject_px: float, rejections: int, min_neighbours: int) 
         gx = qxx * sxt + qxy * syt
         gy = qxy * sxt + qyy * syt
         t0 = mt - gx * mx - gy * my + t_ref
-        limit = reject_px * math.sqrt(gx * gx + gy * gy)
+        limit = _reach_s(reject_px, gx * gx + gy * gy, time_noise_s)
         rss = 0.0
         outliers = np.int64(0)
         for i in range(SIZE):
@@ -123,16 +148,18 @@ def fit_plane(age: F64, reject_px: float, rejections: int, min_neighbours: int) 
 
 
 @njit(fastmath=ANY_ORDER, cache=True, nogil=True, error_model="numpy")
-def widen_plane(fit: PlaneFit, age: F64, reject_px: float, max_rms_px: float) -> tuple[PlaneFit, float]:
-    """The plane through those of the 7x7 neighbours that lie within ``reject_px`` of ``fit``.
+def widen_plane(
+    fit: PlaneFit, age: F64, reject_px: float, max_rms_px: float, time_noise_s: float = 0.0
+) -> tuple[PlaneFit, float]:
+    """The plane through those of the 7x7 neighbours that lie within ``reject_px`` of ``fit``, or in its time noise.
 
     ``age``: (49,) float64, row-major 7x7 patch, as that of ``fit_plane``; ``fit`` has been found in its middle.
     Returns what ``fit_plane`` does, and by how much the residuals bend along the slope, s/px^2 (>= 0, half the second
-    derivative; as if no neighbour were missing). ``fit`` itself and 0 where the new plane is near-singular or its rms
-    residual is not below ``max_rms_px`` times its slope's norm.
+    derivative; as if no neighbour were missing). ``fit`` itself and 0 where the new plane is near-singular or its
+    ``rms_px`` not below ``max_rms_px``.
     """
     _, gx, gy, t0, _, _, _, _ = fit
-    limit = reject_px * math.sqrt(gx * gx + gy * gy)
+    limit = _reach_s(reject_px, gx * gx + gy * gy, time_noise_s)
     # Moments of the residuals: what the slope and the time of the new plane differ by follows from them.
     n = x = y = xx = xy = yy = 0.0
     r = xr = yr = rr = xxr = xyr = yyr = 0.0
@@ -168,7 +195,7 @@ def widen_plane(fit: PlaneFit, age: F64, reject_px: float, max_rms_px: float) ->
     gy += hy
     rms = math.sqrt(max(rr - r * mr - hx * sxr - hy * syr, 0.0) / n)
     slope2 = gx * gx + gy * gy
-    if not rms < max_rms_px * math.sqrt(slope2):
+    if not rms_px(rms, slope2, time_noise_s) < max_rms_px:
         return fit, 0.0
     # On the full grid x^2, x y and y^2 are orthogonal to the plane (but for their means) and to each other.
     a, b, c = (xxr - 4.0 * r) / 588.0, (yyr - 4.0 * r) / 588.0, xyr / 784.0
@@ -177,10 +204,10 @@ def widen_plane(fit: PlaneFit, age: F64, reject_px: float, max_rms_px: float) ->
 
 
 @njit(cache=True, nogil=True)
-def honest_rms(n: int, rms: float, slope: float) -> float:
+def honest_rms(n: int, rms: float, slope: float, time_noise_s: float = 0.0) -> float:
     """Standard deviation of a neighbour's time about the true plane, s, from a fit's ``n``, ``rms`` and slope's norm.
 
     The mean of what the residuals say, less the three parameters fitted to them, and of what is usual.
     """
-    usual = USUAL_RMS_PX * slope
-    return math.sqrt((n * rms * rms + USUAL_WEIGHT * usual * usual) / (n - 3 + USUAL_WEIGHT))
+    usual2 = USUAL_RMS_PX * USUAL_RMS_PX * slope * slope + time_noise_s * time_noise_s
+    return math.sqrt((n * rms * rms + USUAL_WEIGHT * usual2) / (n - 3 + USUAL_WEIGHT))

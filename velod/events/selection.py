@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from velod.events.plane_fit import HALF, REACH, SIZE, fit_plane
+from velod.events.plane_fit import HALF, REACH, SIZE, fit_plane, rms_px
 from velod.events.sae import NEVER, age_unit_ns
 from velod.types import F64, I64, PATCH, U8, U16
 
@@ -25,6 +25,9 @@ GOOD = 0.5
 
 MAX_ASYMMETRY = 0.5
 """Neighbourhoods less symmetric than this about the event are not worth a fit (0: a plane, 1: half an edge)."""
+
+SYMMETRY_NOISE = 8.0
+"""... but for what the time stamps' noise adds to the four sums of it, in its standard deviations."""
 
 I32 = NDArray[np.int32]
 U64 = NDArray[np.uint64]
@@ -48,14 +51,16 @@ def select_burst(
     border_px: int,
     quota: int,
     seq: int,
+    time_noise_s: float = 0.0,
 ) -> tuple[U16, U16, U8]:
     """First events of bursts whose edge has just passed the whole of their neighbourhood.
 
     An event itself comes when its edge has crossed half of the neighbourhood; the plane can be fitted without bias
     only once the other half has fired too. So an event is selected in the batch that completes its 7x7: the newest of
     its outer same-polarity neighbours on ``first`` (2, h, w), int64 ns, lies in [t_start_ns, t_end_ns), and a plane
-    leaves ``min_neighbours`` of the inner 25 after rejection (see ``fit_plane``) with an rms below ``max_rms_px``. It
-    is at most half the memory old, so it may be older than the batch.
+    leaves ``min_neighbours`` of the inner 25 after rejection (see ``fit_plane``) and ``rms_px`` below ``max_rms_px``.
+    It is at most half the memory old, so it may be older than the batch. Time stamps have an error of
+    ``time_noise_s``.
 
     What the quota leaves room for are events with a 5x5 alone: completed in the time before that is as long as the
     batch where edges are too short or too curved for a 7x7, at once where they are too slow for one to fit into the
@@ -70,15 +75,16 @@ def select_burst(
     span = -((t_start_ns - t_end_ns) // unit_ns)
     oldest = memory_ns // 2 // unit_ns
     border_px = max(border_px, REACH)
+    slack = SYMMETRY_NOISE * time_noise_s * 1e9 / unit_ns
     chosen = np.empty(0, np.int32)
     for reach_px, since, until in ((REACH, span, 0), (HALF, 2 * span, span)):
         room = quota - len(chosen)
         if room > 0:
             mask, marks = _new_mask(first)
-            _mark_passed(encoded, border_px, reach_px, oldest, since, until, oldest - span, mask)
+            _mark_passed(encoded, border_px, reach_px, oldest, since, until, oldest - span, slack, mask)
             more = _choose(
                 first, marks, t_end_ns, memory_ns, room, seq,
-                True, reject_px, rejections, min_neighbours, max_rms_px, taken,
+                True, reject_px, rejections, min_neighbours, max_rms_px, time_noise_s, taken,
             )  # fmt: skip
             taken.reshape(-1)[more] = first.reshape(-1)[more]
             chosen = np.concatenate([chosen, more])
@@ -108,7 +114,7 @@ def select_paper(
     none_taken = np.full(last.shape, NEVER, np.int64)
     chosen = _choose(
         last, marks, t_end_ns, memory_ns, quota, seq,
-        False, time_share * (t_end_ns - t_start_ns) * 1e-9, 0, PAPER_MIN_NEIGHBOURS, math.inf, none_taken,
+        False, time_share * (t_end_ns - t_start_ns) * 1e-9, 0, PAPER_MIN_NEIGHBOURS, math.inf, 0.0, none_taken,
     )  # fmt: skip
     return _columns(chosen, last)
 
@@ -143,6 +149,7 @@ def _choose(
     rejections: int,
     min_neighbours: int,
     max_rms_px: float,
+    time_noise_s: float,
     taken: I64,
 ) -> I32:
     """Flat indices into ``surface`` of at most ``quota`` events out of those marked (see ``_new_mask``).
@@ -158,25 +165,34 @@ def _choose(
     chosen = np.empty(quota, np.int32)
     n = _take_in_turn(
         surface, t_end_ns, memory_ns, burst, tolerance, rejections, min_neighbours,
-        max_rms_px, seq, index, cell_end, chosen,
+        max_rms_px, time_noise_s, seq, index, cell_end, chosen,
     )  # fmt: skip
     return chosen[:n]
 
 
 @njit(cache=True, nogil=True)
 def _mark_passed(
-    age: U16, border_px: int, reach_px: int, oldest: int, since: int, until: int, slow: int, mask: U8
+    age: U16,
+    border_px: int,
+    reach_px: int,
+    oldest: int,
+    since: int,
+    until: int,
+    slow: int,
+    slack: float,
+    mask: U8,
 ) -> None:
     """Mark pixels whose eight neighbours ``reach_px`` away lie symmetrically about them in time, as on a plane.
 
     A filter that vectorises, and spares most of the fits. The pixel's ``age`` must be below ``oldest``, that of its
     newest outer neighbour below ``since`` and at least ``until``, or any where the edge takes more than ``slow`` from
-    the middle to ``REACH``; all in encoded steps, of which 0 counts as oldest.
+    the middle to ``REACH``; all in encoded steps, of which 0 counts as oldest. ``slack`` of asymmetry is allowed
+    in any case.
     """
     _, h, w = age.shape
     # Single precision holds the sums of a few steps exactly, in lanes half as wide as those of integers would be.
     oldest_, since_, until_ = np.float32(oldest), np.float32(since), np.float32(until)
-    slow_ = np.float32(slow) * np.float32(reach_px)
+    slow_, slack_ = np.float32(slow) * np.float32(reach_px), np.float32(slack)
     west, east = border_px - reach_px, border_px + reach_px
     n = w - 2 * border_px
     for k in range(2):
@@ -194,7 +210,7 @@ def _mark_passed(
                 g, j = _oldest_if_none(ne[i]) - t, _oldest_if_none(sw[i]) - t
                 symmetric = abs(a + b) + abs(c + d) + abs(e + f) + abs(g + j)
                 antisymmetric = abs(a - b) + abs(c - d) + abs(e - f) + abs(g - j)
-                plane = symmetric <= np.float32(MAX_ASYMMETRY) * antisymmetric
+                plane = symmetric <= np.float32(MAX_ASYMMETRY) * antisymmetric + slack_
                 newest = min(min(min(a, b), min(c, d)), min(min(e, f), min(g, j)))
                 passed = newest + t
                 waited = (passed >= until_) | (np.float32(REACH) * (t - passed) > slow_)
@@ -254,6 +270,7 @@ def _take_in_turn(
     rejections: int,
     min_neighbours: int,
     max_rms_px: float,
+    time_noise_s: float,
     seq: int,
     index: I32,
     cell_end: I32,
@@ -288,12 +305,12 @@ def _take_in_turn(
                 k, r, c = flat // (h * w), flat // w % h, flat % w
                 _ages(surface[k], r, c, t_end_ns, memory_ns, age)
                 if burst:
-                    rms_px = _plane_rms_px(age, tolerance, rejections, min_neighbours)
+                    residual_px = _plane_rms_px(age, tolerance, rejections, min_neighbours, time_noise_s)
                 else:
-                    rms_px = 0.0 if _obeys_paper(age, min_neighbours, tolerance) else math.inf
-                if not rms_px < max_rms_px:
+                    residual_px = 0.0 if _obeys_paper(age, min_neighbours, tolerance) else math.inf
+                if not residual_px < max_rms_px:
                     continue
-                if rms_px < GOOD * max_rms_px and n < chosen.size:
+                if residual_px < GOOD * max_rms_px and n < chosen.size:
                     chosen[n] = flat
                     n += 1
                 elif n_reserve < reserve.size:
@@ -334,11 +351,10 @@ def _ages(surface: I64, r: int, c: int, t_end_ns: int, memory_ns: int, age: F64)
 
 
 @njit(cache=True, nogil=True)
-def _plane_rms_px(age: F64, reject_px: float, rejections: int, min_neighbours: int) -> float:
+def _plane_rms_px(age: F64, reject_px: float, rejections: int, min_neighbours: int, time_noise_s: float) -> float:
     """How well one plane explains the neighbourhood, px; inf where none does."""
-    left, gx, gy, _, rms, _, _, _ = fit_plane(age, reject_px, rejections, min_neighbours)
-    slope = math.hypot(gx, gy)
-    return rms / slope if left > 0 and slope > 0.0 else math.inf
+    left, gx, gy, _, rms, _, _, _ = fit_plane(age, reject_px, rejections, min_neighbours, time_noise_s)
+    return rms_px(rms, gx * gx + gy * gy, time_noise_s) if left > 0 else math.inf
 
 
 @njit(cache=True, nogil=True)

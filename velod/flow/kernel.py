@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numba import njit
 
-from velod.events.plane_fit import INNER_AT, RING_AT, SIZE, WIDE_SIZE, fit_plane, honest_rms, widen_plane
+from velod.events.plane_fit import INNER_AT, RING_AT, SIZE, WIDE_SIZE, fit_plane, honest_rms, rms_px, widen_plane
 from velod.types import F32, F64, I64, RING, U16, U32
 
 REFUSALS = ("unfit", "rms", "speed", "unrectified")
@@ -39,13 +39,15 @@ def fit_flows(
     max_rms_px: float,
     max_speed_px_s: float,
     benosman: bool,
+    time_noise_s: float,
     index: U16,
     flow: F32,
     refused: I64,
 ) -> int:
     """Flows of n events at sensor pixels ``x``, ``y`` (n,) with ``patch`` (n, 25) ages in ns, 0 = none.
 
-    ``ring`` holds the ages around them, (n, 24), or has no rows: then the planes stay on their 5x5 neighbours.
+    ``ring`` holds the ages around them, (n, 24), or has no rows: then the planes stay on their 5x5 neighbours. Their
+    error is ``time_noise_s`` beside what the edges' shapes do.
     ``xy`` (h, w, 2) and ``covector`` (h, w, 2, 2) take sensor pixels and SAE gradients to the rectified image.
     Writes for each of the m flows its position in the batch to ``index`` and (x, y, nx, ny, speed, sigma) in
     rectified px and px/s to ``flow`` (n, 6); adds the others to ``refused`` by cause. Returns m.
@@ -56,7 +58,7 @@ def fit_flows(
     for i in range(x.size):
         for j in range(SIZE):
             age[j] = patch[i, j] * 1e-9
-        fit = fit_plane(age, reject_px, rejections, min_neighbours)
+        fit = fit_plane(age, reject_px, rejections, min_neighbours, time_noise_s)
         if fit[0] == 0:
             refused[_UNFIT] += 1
             continue
@@ -66,10 +68,10 @@ def fit_flows(
                 wide[INNER_AT[j]] = age[j]
             for j in range(RING):
                 wide[RING_AT[j]] = ring[i, j] * 1e-9
-            fit, bend = widen_plane(fit, wide, reject_px, max_rms_px)
+            fit, bend = widen_plane(fit, wide, reject_px, max_rms_px, time_noise_s)
         n, gx, gy, _, rms, qxx, qxy, qyy = fit
         slope = math.sqrt(gx * gx + gy * gy)
-        if not rms < max_rms_px * slope:
+        if not rms_px(rms, slope * slope, time_noise_s) < max_rms_px:
             refused[_RMS] += 1
             continue
         r, c = y[i], x[i]
@@ -88,7 +90,7 @@ def fit_flows(
         # Eq. 6: the normal flow is grad_T / |grad_T|^2.
         nx, ny, speed = tx / grad_T, ty / grad_T, 1.0 / grad_T
         # Variances of the slope along n and across it, as shares of the slope: errors of speed and of direction.
-        sigma_t = INFLATION * honest_rms(n, rms, slope)
+        sigma_t = INFLATION * honest_rms(n, rms, slope, time_noise_s)
         along = math.hypot(
             speed * sigma_t * _deviation(qxx, qxy, qyy, a * nx + d * ny, b * nx + e * ny),
             BEND_PX * bend / slope,

@@ -43,6 +43,7 @@ class FlowStage:
             readonly(m.patch, np.uint32), readonly(m.ring, np.uint32),
             self._xy, self._covector,
             s.reject_px, s.rejections, s.min_neighbours, s.max_rms_px, s.max_speed_px_s, s.method == "benosman",
+            1e-9 * m.time_noise_ns,
             index, flow, refused,
         )  # fmt: skip
         self.counters["batches"] += 1

@@ -40,6 +40,7 @@ class Slices:
         self._stamps = np.empty((MAX_SELECTED, WIDE_SIZE), np.int64)
         self._shape = (height, width)
         self._seq = -1
+        self._time_noise_ns = 0
         self.forget()
 
     def forget(self) -> None:
@@ -63,13 +64,20 @@ class Slices:
         return self._sent > 0
 
     def advance(
-        self, left: CameraStream, batch: OpenBatch, batch_seq: int, horizon_ns: int, budget: Budget
+        self,
+        left: CameraStream,
+        batch: OpenBatch,
+        batch_seq: int,
+        horizon_ns: int,
+        budget: Budget,
+        time_noise_ns: int,
     ) -> list[EventBatch]:
         """Enter the left events before ``horizon_ns``, all of them of ``batch``; returns the slices that are over.
 
         With a share of the selection cells rest longer, and without ``budget.slices`` what is selected waits for a
-        later slice, at the latest that at the batch's end.
+        later slice, at the latest that at the batch's end. Time stamps have an error of ``time_noise_ns``.
         """
+        self._time_noise_ns = time_noise_ns
         out: list[EventBatch] = []
         rest_ns = round(self._settings.ingest.rest_ms * 1e6 / budget.selection)
         while True:
@@ -99,6 +107,10 @@ class Slices:
         age = np.minimum(t_end_ns - self._stamps[: self._n, MIDDLE], MAX_AGE_NS)
         return x.astype(np.uint16), y.astype(np.uint16), age.astype(np.uint32), p.astype(np.uint8)
 
+    def patches(self, t_end_ns: int) -> U32:
+        """(n, 25) ages in ns of the 5x5 neighbours of all events that were selected since ``begin_batch``."""
+        return self._ages(slice(self._n), t_end_ns)[1]
+
     def _enter(self, left: CameraStream, batch: OpenBatch, t_ns: int, rest_ns: int) -> None:
         s, fit = self._settings.ingest, self._settings.flow
         x, y, t, p = left.take_before(t_ns)
@@ -106,6 +118,7 @@ class Slices:
             x, y, t, p, left.first, left.last, left.refractory_ns,
             self._taken, self._open_ns, self._row_cell, self._column_cell, rest_ns, s.border_px,
             self._memory_ns, fit.reject_px, fit.rejections, s.min_neighbours, fit.max_rms_px,
+            1e-9 * self._time_noise_ns,
             self._at, self._stamps, self._n,
         )  # fmt: skip
         self._n_events += len(t)
@@ -119,14 +132,22 @@ class Slices:
         self._seq += 1
         first, new = self._sent, slice(self._sent, self._n)
         n_events, self._n_events = self._n_events, 0
-        n, self._sent = self._n - self._sent, self._n
+        self._sent = self._n
         p, y, x = self._at[new].T
-        age, patch, ring = np.empty(n, np.uint32), np.empty((n, SIZE), np.uint32), np.empty((n, RING), np.uint32)
-        split_ages(self._stamps[new], t_end_ns, self._memory_ns, age, patch, ring)
+        age, patch, ring = self._ages(new, t_end_ns)
         if self._t_start_ns < 0:
             assert batch.t_start_ns is not None
             self._t_start_ns = batch.t_start_ns
         return EventBatch(
             self._seq, t_end_ns, self._t_start_ns, n_events,
             x.astype(np.uint16), y.astype(np.uint16), age, p.astype(np.uint8), patch, batch_seq, first, ring,
+            self._time_noise_ns,
         )  # fmt: skip
+
+    def _ages(self, which: slice, t_end_ns: int) -> tuple[U32, U32, U32]:
+        """age (n,), patch (n, 25) and ring (n, 24) of these of the selected, ns before ``t_end_ns``."""
+        stamps = self._stamps[which]
+        n = len(stamps)
+        age, patch, ring = np.empty(n, np.uint32), np.empty((n, SIZE), np.uint32), np.empty((n, RING), np.uint32)
+        split_ages(stamps, t_end_ns, self._memory_ns, age, patch, ring)
+        return age, patch, ring

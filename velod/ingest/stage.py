@@ -16,6 +16,7 @@ from velod.events.plane_fit import SIZE
 from velod.events.sae import age_unit_ns, encode_ages, encode_newest, gather_patches, new_surface
 from velod.events.selection import select_burst, select_paper
 from velod.events.sensor_size import for_sensor
+from velod.events.time_noise import TimeNoise
 from velod.geometry.calibration import Calibration
 from velod.ingest.batch import OpenBatch
 from velod.ingest.budget import Budget
@@ -61,6 +62,7 @@ class IngestStage:
         self._imu = ImuStream(s, cal.time_offset_s, self.counters, self.alarms)
         self._taken = new_surface(cal.left.height, cal.left.width)
         self._open = OpenBatch(s)
+        self._time_noise = TimeNoise(self._settings.flow)
         self._batch_t_ns = 0
         if self._slices is not None:
             # Parts of a batch that will never be whole must not join another one.
@@ -138,7 +140,11 @@ class IngestStage:
         if self._slices is None:
             self._open.fill(self._left.enter_before(horizon_ns))
             return []
-        return [*self._slices.advance(self._left, self._open, self._batch_seq + 1, horizon_ns, self.budget)]
+        return [
+            *self._slices.advance(
+                self._left, self._open, self._batch_seq + 1, horizon_ns, self.budget, self._noise_ns
+            )
+        ]
 
     def _is_complete(self, t_end_ns: int) -> bool:
         """Whether all events before ``t_end_ns`` are known, or will not be waited for."""
@@ -182,17 +188,26 @@ class IngestStage:
         left_last, right_last = (
             encode_newest(camera.last, t_end_ns, memory_ns) for camera in (self._left, self._right)
         )
+        noise_ns = self._noise_ns
         event_batches: list[EventBatch]
         if self._slices is None:
             x, y, age, p, patch, ring = self._select(left, t_start_ns, t_end_ns)
-            event_batches = [EventBatch(seq, t_end_ns, t_start_ns, n_events, x, y, age, p, patch, seq, ring=ring)]
+            event_batches = [
+                EventBatch(
+                    seq, t_end_ns, t_start_ns, n_events, x, y, age, p, patch, seq, ring=ring, time_noise_ns=noise_ns
+                )
+            ]
+            self._time_noise.learn(patch)
         else:
+            self._time_noise.learn(self._slices.patches(t_end_ns))
             x, y, age, p = self._slices.selected(t_end_ns)
             event_batches = self._slices.rest_of(self._open, seq, t_end_ns)
             t_start_ns = self._slices.begin_batch()
         unit_ns = age_unit_ns(memory_ns)
         return [
-            StereoBatch(seq, t_end_ns, t_start_ns, unit_ns, x, y, age, p, left, right, left_last, right_last),
+            StereoBatch(
+                seq, t_end_ns, t_start_ns, unit_ns, x, y, age, p, left, right, left_last, right_last, noise_ns
+            ),
             *event_batches,
             self._no_samples(t_end_ns),
         ]
@@ -207,7 +222,7 @@ class IngestStage:
                 surface, self._taken, encoded, t_start_ns, t_end_ns,
                 memory_ns=memory_ns, reject_px=fit.reject_px, rejections=fit.rejections,
                 min_neighbours=s.min_neighbours, max_rms_px=fit.max_rms_px,
-                border_px=s.border_px, quota=quota, seq=self._batch_seq,
+                border_px=s.border_px, quota=quota, seq=self._batch_seq, time_noise_s=1e-9 * self._noise_ns,
             )  # fmt: skip
         else:
             surface = self._left.last
@@ -220,6 +235,11 @@ class IngestStage:
         ring = np.empty((len(x) if s.selection == "burst" else 0, RING), np.uint32)
         gather_patches(surface, x, y, p, t_end_ns, memory_ns, age, patch, ring)
         return x, y, age, p, patch, ring
+
+    @property
+    def _noise_ns(self) -> int:
+        """What is known of the time stamps' errors; the paper's rules know nothing of them."""
+        return self._time_noise.sigma_ns if self._settings.ingest.selection == "burst" else 0
 
     def _no_samples(self, t_end_ns: int) -> ImuSamples:
         """Tells the optimizer how far the events have come without waiting for the IMU."""

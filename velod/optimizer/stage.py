@@ -33,6 +33,8 @@ VALID_SIGMA, VALID_SHARE = 0.1, 0.01
 """A velocity becomes valid when its largest sigma is below VALID_SIGMA m/s + VALID_SHARE of its speed ..."""
 EARLY_NS, EARLY_FACTOR = 70_000_000, 0.5
 """... times EARLY_FACTOR while less than EARLY_NS have been seen, when gravity is hardly known ..."""
+LATE_NS, LATE_FACTOR = 300_000_000, 2.0
+"""... and times LATE_FACTOR from LATE_NS on: a velocity that says how uncertain it is, is worth more than none ..."""
 LOST_FACTOR = 4.0
 """... and stays valid until it is this many times larger."""
 DEGRADED_AFTER_NS = 100_000_000
@@ -327,8 +329,9 @@ class OptimizerStage:
             state = TrackingState.LOST if self._was_lost else TrackingState.INITIALISING
             if self._estimator.batches < MIN_BATCHES:
                 return state, f"{self._estimator.batches} usable batches", False
-            early = tau - self._estimator.first_usable_t_ns < EARLY_NS
-            if sigma > limit * (EARLY_FACTOR if early else 1.0):
+            seen_ns = tau - self._estimator.first_usable_t_ns
+            factor = EARLY_FACTOR if seen_ns < EARLY_NS else 1.0 if seen_ns < LATE_NS else LATE_FACTOR
+            if sigma > limit * factor:
                 return state, self._uncertain(tau, sigma), False
             self._was_valid, self._was_lost = True, False
         if sigma > LOST_FACTOR * limit:
