@@ -223,6 +223,13 @@ class OptimizerSettings:
     delay_sigma_ms: float = _f(
         1.0, "1 sigma of how much later than the IMU's the events' stamps are, ms", above=0.0, hi=100.0
     )
+    imu_clock_sigma_ms: float = _f(
+        20.0,
+        "1 sigma of the events' stamps against the IMU's, before anything is known of them, ms",
+        above=0.0,
+        hi=1e3,
+    )
+    correct_imu_clock: bool = _f(True, "a delay of the events against the IMU is taken out of their stamps")
     zero_velocity: bool = _f(True, "rest is observed as zero velocity: no moving events and a quiet IMU")
     ransac_iterations: int = _f(64, "minimal samples of the linear solver (Eq. 15)", lo=8, hi=10_000)
     min_flows: int = _f(12, "flows with a depth that a batch must have", lo=6, hi=10_000)
@@ -234,6 +241,15 @@ class OptimizerSettings:
     )
     alarm_scale_percent: float = _f(
         0.5, "alarm where the scale is seen to differ from the IMU's by more, %; 0: never", lo=0.0, hi=50.0
+    )
+    alarm_imu_clock_ms: float = _f(
+        1.0, "alarm where events are seen to be later or earlier than the IMU by more, ms; 0: never", lo=0.0, hi=100.0
+    )
+    alarm_imu_rotation_deg: float = _f(
+        1.0,
+        "alarm where T_cam_imu's rotation is seen to be off by more about an axis, degrees; 0: never",
+        lo=0.0,
+        hi=90.0,
     )
     seed: int = _f(1, "of all random choices", lo=0, hi=2**31 - 1)
 

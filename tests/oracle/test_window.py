@@ -280,7 +280,9 @@ def estimator(request):
     R_LB = e.memory.at(np.array([250_000_000]))[0][0]
     g_L = np.array([1.0, -9.0, 3.0])
     v_B, s_L = np.array([3.0, -1.0, 2.0]), e.memory.at(np.array([250_000_000]))[1][0]
-    e.head = Head(250_000_000, v_B, b_a, b_w, g_L, R_LB, np.eye(12) * 1e-4, np.zeros(3), R_LB @ v_B - s_L)
+    e.head = Head(
+        250_000_000, v_B, b_a, b_w, g_L, R_LB, np.eye(12) * 1e-4, np.zeros(3), np.eye(3) * 1e-6, R_LB @ v_B - s_L
+    )
     return e
 
 
@@ -390,6 +392,27 @@ def test_counting_the_spline_from_another_origin_moves_it_and_nothing_else():
     assert np.allclose((F @ y.x)[:3] - before[:3], [300.0, -20.0, 5.0], atol=1e-6)
     assert np.allclose((F @ y.x)[3:], before[3:], atol=1e-5)
     assert np.allclose(y.cov(F), P)
+
+
+def test_common_errors_counted_from_another_origin_move_and_nothing_else():
+    """A delay that is taken out of the stamps: flows of the window say the same of what is left of it."""
+    w, t = filled(4, np.random.default_rng(5)), int(11.7 * KNOT_NS)
+    F, own = w.selector(t), w.common_columns(w.last)
+    x = w.solve([], None, 0.0).x.copy()
+    w.shift(np.zeros(3), np.array([0.0, -0.003, 0.0]))
+    y = w.solve([], None, 0.0).x
+    assert np.allclose(y[own] - x[own], [0.0, -0.003, 0.0], atol=1e-9)
+    assert np.allclose(F @ y, F @ x, atol=1e-5)
+
+
+def test_a_common_error_that_begins_anew_owes_nothing_to_those_before():
+    w = filled(4, np.random.default_rng(5))
+    w.begin_common_anew(1)
+    w.extend(np.eye(3) * 0.1, np.array([1.0, -9.0, 3.0]), np.zeros(3), 0.1)
+    H, _ = dense(w)
+    before, own = w.common_columns(w.last - 1), w.common_columns(w.last)
+    assert H[own[1], before[1]] == 0.0 and np.isclose(H[own[1], own[1]], COMMON_SIGMA[1] ** -2)
+    assert H[own[0], before[0]] < 0.0 and H[own[2], before[2]] < 0.0
 
 
 def test_an_estimate_does_not_notice_that_the_integrated_velocity_is_counted_anew(monkeypatch):

@@ -117,6 +117,7 @@ def paper_settings(settings: Settings) -> Settings:
             flow_scale_sigma=NO_COMMON_ERROR,
             depth_scale_sigma=NO_COMMON_ERROR,
             delay_sigma_ms=NO_COMMON_ERROR,
+            correct_imu_clock=False,
         ),
     )
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from velod.config import OptimizerSettings
+from velod.optimizer.rotation_check import Offsets
 from velod.optimizer.scale_check import ScaleCheck
 from velod.optimizer.stereo_check import StereoCheck
 from velod.types import F64, DepthBatch, FlowBatch
@@ -15,6 +16,7 @@ SURE = 3.0
 """An alarm is raised when a value is beyond its limit by this many sigmas."""
 
 CLOCK, ROWS, SCALE = "calibration.clock", "calibration.rows", "calibration.scale"
+IMU_CLOCK, IMU_ROTATION = "calibration.imu_clock", "calibration.imu_rotation"
 
 
 class CalibrationCheck:
@@ -27,8 +29,11 @@ class CalibrationCheck:
             CLOCK: settings.alarm_clock_ms,
             ROWS: settings.alarm_rows_px,
             SCALE: settings.alarm_scale_percent,
+            IMU_CLOCK: settings.alarm_imu_clock_ms,
+            IMU_ROTATION: settings.alarm_imu_rotation_deg,
         }
         self._stereo, self._scale = StereoCheck(), ScaleCheck()
+        self._offsets: Offsets | None = None
         self._turn = 0
 
     def add_batch(self, flow: FlowBatch, depth: DepthBatch) -> None:
@@ -52,6 +57,18 @@ class CalibrationCheck:
             self._judge(
                 SCALE, "percent", percent, "the cameras' scale is {:+.2f} +- {:.2f} % off the IMU's: baseline?"
             )
+
+    def add_offsets(self, offsets: Offsets) -> None:
+        """The newest of the events against the IMU; the same again says nothing new."""
+        if offsets is self._offsets:
+            return
+        self._offsets = offsets
+        clock = (1e3 * offsets.delay_s, 1e3 * offsets.delay_sigma_s)
+        self._judge(IMU_CLOCK, "ms", clock, "the events are {:+.2f} +- {:.2f} ms late against the IMU")
+        turned, sigma, axis_B = offsets.worst_turn
+        axis = "[{:+.2f} {:+.2f} {:+.2f}]".format(*axis_B)
+        text = "the camera is turned by {:+.2f} +- {:.2f} degrees about " + axis + " of the IMU: T_cam_imu?"
+        self._judge(IMU_ROTATION, "deg", (math.degrees(turned), math.degrees(sigma)), text)
 
     def _judge(self, name: str, unit: str, value_and_sigma: tuple[float, float], text: str) -> None:
         value, sigma = value_and_sigma

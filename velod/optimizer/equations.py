@@ -55,9 +55,15 @@ class EquationMaker:
         self._R_LB = np.empty((capacity, 3, 3))
 
     def make(
-        self, flow: FlowBatch, depth: DepthBatch, memory: InertialMemory, earliest_ns: int, known: Prediction | None
+        self,
+        flow: FlowBatch,
+        depth: DepthBatch,
+        memory: InertialMemory,
+        earliest_ns: int,
+        known: Prediction | None,
+        late_ns: int = 0,
     ) -> Equations:
-        """The rows of all events since ``earliest_ns``, which the memory covers.
+        """The rows of all events since ``earliest_ns``, which the memory covers, ``late_ns`` before their stamps.
 
         ``known`` gives the rows of common errors; they are 0 without it, and where the memory does not reach back.
         """
@@ -65,7 +71,7 @@ class EquationMaker:
             self._grow(2 * len(flow.index))
         m = _usable(
             readonly(flow.index, np.uint16), readonly(depth.index, np.uint16), readonly(flow.age, np.uint32),
-            flow.t_ns, earliest_ns, self._at_flow, self._at_depth, self._t_ns,
+            flow.t_ns - late_ns, earliest_ns, self._at_flow, self._at_depth, self._t_ns,
         )  # fmt: skip
         at_flow, at_depth, t_ns = self._at_flow[:m], self._at_depth[:m], self._t_ns[:m]
         R_LB, columns = self._R_LB[:m], [column[:m] for column in self._columns]

@@ -14,13 +14,13 @@ from velod.optimizer import attitude, degeneracy, flow_equation, inertial_residu
 from velod.optimizer.attitude import Attitude
 from velod.optimizer.consistency import Consistency
 from velod.optimizer.equations import EquationMaker, Equations, Prediction
-from velod.optimizer.flow_equation import BIN_NS, RIDGE, Bins, Fit, Rows
+from velod.optimizer.flow_equation import BIN_NS, COMMON, RIDGE, Bins, Fit, Rows
 from velod.optimizer.frame import Rate
 from velod.optimizer.inertial import InertialMemory
 from velod.optimizer.interval import Interval
 from velod.optimizer.preintegration import Preintegration, preintegrate
+from velod.optimizer.rotation_check import RotationCheck
 from velod.optimizer.small import squared_distance
-from velod.optimizer.spline import locate
 from velod.optimizer.standstill import QUIET_EVENTS, QUIET_NS, Standstill
 from velod.optimizer.window import Window
 from velod.types import F64, NS_PER_S, DepthBatch, FlowBatch, ImuSamples
@@ -59,6 +59,7 @@ class Head:
     R_LB: F64
     cov: F64
     common: F64  # (3,) common errors of the flows, flow_equation.COMMON
+    common_cov: F64  # (3, 3)
     e_L: F64  # (3,) e of v_B = R_BL (s_L + e), m/s
 
     def e_at(self, t_ns: int) -> F64:
@@ -78,7 +79,10 @@ class Head:
 class Estimator:
     """Sliding-window estimate of v_B by Eq. 14 with the states of Eq. 12 and gravity."""
 
-    def __init__(self, settings: Settings, calibration: Calibration) -> None:
+    def __init__(
+        self, settings: Settings, calibration: Calibration, rotation_check: RotationCheck | None = None
+    ) -> None:
+        """``rotation_check``: that of the estimator before, of the same rig."""
         o = settings.optimizer
         rect = rectify(calibration)
         self._o, self._imu = o, settings.imu
@@ -91,6 +95,9 @@ class Estimator:
         self._segments = int(np.ceil(o.window_s / o.knot_s)) + 1
         self._bias_margin = 1.0
         self.consistency = Consistency()
+        self.rotation_check = rotation_check or RotationCheck(
+            o.imu_clock_sigma_ms * 1e-3, settings.imu.gyro_noise, o.correct_imu_clock
+        )
         self._standstill = Standstill(settings.imu, calibration.left.width * calibration.left.height)
         self._forget()
 
@@ -126,6 +133,7 @@ class Estimator:
         """Take a batch in; the IMU must cover its end. A batch older than the head adds what it knows."""
         self.memory.integrate_to(flow.t_ns, *self._biases())
         self._start_anew_where_it_is_wrong(flow.t_ns)
+        self._correct_stamps(flow.t_ns)
         equations = self._equations(flow, depth)
         late = self.head is not None and flow.t_ns <= self.head.t_ns
         predicted = None if late or self.head is None else self.predict(flow.t_ns)
@@ -160,6 +168,13 @@ class Estimator:
             self._count("bias.beyond_specification")
             self._bias_margin = BIAS_MARGIN
             self._forget()
+
+    def _correct_stamps(self, t_ns: int) -> None:
+        """Take the delay of the events out of their stamps, once it is certain."""
+        if (step_s := self.rotation_check.advance(self.memory, t_ns)) != 0.0:
+            self._count("clock.corrected")
+            self._shift(np.zeros(3), np.array([0.0, -step_s, 0.0]))
+            self.window.begin_common_anew(COMMON.index("delay"))
 
     def _biases_exceed_specification(self) -> bool:
         """Whether they were not drawn with the sigmas of the settings; later on they may have walked."""
@@ -262,7 +277,7 @@ class Estimator:
             earliest_ns = max(earliest_ns, self.window.first * self._knot_ns)
         head = self.head
         known = None if head is None else Prediction(head.t_ns, head.e_L, head.g_L)
-        equations = self._maker.make(flow, depth, self.memory, earliest_ns, known)
+        equations = self._maker.make(flow, depth, self.memory, earliest_ns, known, self.rotation_check.late_ns)
         if len(equations.on_error.z) < self._o.min_flows:
             if flow.n_selected > 0:
                 self._count("fit.few_flows")
@@ -355,6 +370,10 @@ class Estimator:
             self._count("fit.inconsistent")
         on_spline = equations.on_error if self._o.spline == "error" else equations.on_velocity
         bins = flow_equation.compress(on_spline, equations.common, fit, shared, self._slope())
+        if not len(weak_L) and predicted is not None and self.head is not None:
+            R_LB = self.memory.at(np.array([t_ns]))[0][0]
+            cov_e = R_LB @ predicted[1] @ R_LB.T
+            self.rotation_check.add(bins, self._slope(), t_ns, self.head.e_at(t_ns), cov_e)
         if len(weak_L):
             self._count("fit.degenerate")
             R_LB, _, _ = self._frame(t_ns)
@@ -423,10 +442,16 @@ class Estimator:
             _, s_L, _ = self.memory.at(np.array([self.head.t_ns]))
             if np.linalg.norm(s_L[0]) > MAX_INTEGRATED:
                 self.memory.shift(-s_L[0])
-                self.window.shift(s_L[0])
-                self.head = replace(self.head, e_L=self.head.e_L + s_L[0])
-                for interval in self._open:
-                    interval.shift(s_L[0])
+                self._shift(s_L[0], np.zeros(3))
+
+    def _shift(self, offset_L: F64, common: F64) -> None:
+        """Count e and the common errors from another origin: + offset (3,), + ``common`` (3,)."""
+        if self.head is not None:
+            self.head = replace(self.head, e_L=self.head.e_L + offset_L, common=self.head.common + common)
+        if not self.window.empty:
+            self.window.shift(offset_L, common)
+        for interval in self._open:
+            interval.shift(offset_L, common)
 
     def _solve_head(self, t_ns: int) -> None:
         """Optimum of the window and the state at ``t_ns``, with the IMU of the last incomplete interval."""
@@ -436,16 +461,17 @@ class Estimator:
         if self.head is not None and (sigma := self.head.gravity_direction_sigma) < MAX_DIRECTION_SIGMA:
             g_prior, g_sigma = self.head.g_L, sigma
         solution = self.window.solve(self._open, g_prior, g_sigma)
-        F = self.window.selector(t_ns)
+        F = self.window.selector_with_common(t_ns)
         R_LB, N, M = self._frame(t_ns)
         x = F @ solution.x
         cov = solution.cov(F)
         cov[:3] = M @ cov[:3]
         cov[:, :3] = cov[:, :3] @ M.T
-        common = solution.x[self.window.common_columns(locate(t_ns, self._knot_ns)[0])]
         v_B = N + M @ x[:3]
         e_L = x[:3] if self._o.spline == "error" else R_LB @ v_B - self.memory.at(np.array([t_ns]))[1][0]
-        self.head = Head(t_ns, v_B, x[3:6], x[6:9], x[9:12], R_LB, cov, common, e_L)
+        self.head = Head(
+            t_ns, v_B, x[3:6], x[6:9], x[9:12], R_LB, cov[:12, :12].copy(), x[12:], cov[12:, 12:].copy(), e_L
+        )
 
 
 def _lack(flow: FlowBatch, depth: DepthBatch) -> str:

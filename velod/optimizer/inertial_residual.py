@@ -7,7 +7,7 @@ from numba import njit
 
 from velod.geometry.so3 import hat
 from velod.optimizer.preintegration import Preintegration
-from velod.optimizer.small import add_sandwich, multiply
+from velod.optimizer.small import add_sandwich, invert3, multiply
 from velod.types import F64
 
 IMU_MODEL_SIGMA = 1e-3
@@ -163,7 +163,7 @@ def _linearise(
         G[i, 3 + i] = 1.0
         cov[i, i] = IMU_MODEL_SIGMA**2
     add_sandwich(G, cov_imu, cov)
-    _invert(cov, information)
+    invert3(cov, information)
 
 
 @njit(cache=True, nogil=True)
@@ -174,19 +174,3 @@ def _affine(R_LB: F64, s_L: F64, N: F64, M: F64) -> None:
         for k in range(3):
             M[i, k] = R_LB[k, i]
             N[i] += R_LB[k, i] * s_L[k]
-
-
-@njit(cache=True, nogil=True)
-def _invert(a: F64, out: F64) -> None:
-    """out = a^-1 for symmetric, positive definite a (3, 3), by cofactors."""
-    out[0, 0] = a[1, 1] * a[2, 2] - a[1, 2] * a[2, 1]
-    out[0, 1] = a[0, 2] * a[2, 1] - a[0, 1] * a[2, 2]
-    out[0, 2] = a[0, 1] * a[1, 2] - a[0, 2] * a[1, 1]
-    out[1, 1] = a[0, 0] * a[2, 2] - a[0, 2] * a[2, 0]
-    out[1, 2] = a[0, 2] * a[1, 0] - a[0, 0] * a[1, 2]
-    out[2, 2] = a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]
-    det = a[0, 0] * out[0, 0] + a[0, 1] * out[0, 1] + a[0, 2] * out[0, 2]
-    for i in range(3):
-        for j in range(i, 3):
-            out[i, j] /= det
-            out[j, i] = out[i, j]

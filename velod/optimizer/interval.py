@@ -83,10 +83,10 @@ class Interval:
         self.flows.add(bins, stop, slope)
         self._folded = False
 
-    def shift(self, offset: F64) -> None:
-        """Count the spline from another origin: its values + offset (3,)."""
+    def shift(self, offset: F64, common: F64) -> None:
+        """Count the spline and the common errors from another origin: their values + offset (3,), common (3,)."""
         self.r += (self.blocks[:, :3] + self.blocks[:, 12:]) @ offset
-        self.flows.eta += self.flows.L[:, :, :3] @ offset
+        self.flows.eta += self.flows.L[:, :, :3] @ offset + self.flows.L[:, :, 6:] @ common
         self._folded = False
 
     def fold(self, noise_information: float, knot_ns: int, first: int, H: F64, h: F64, end: I64) -> None:

@@ -83,3 +83,19 @@ def squared_distance(d: F64, S: F64) -> float:
         y[i] /= root[i, i]
         total += y[i] * y[i]
     return total
+
+
+@njit(cache=True, nogil=True)
+def invert3(a: F64, out: F64) -> None:
+    """out = a^-1 for symmetric, positive definite a (3, 3), by cofactors."""
+    out[0, 0] = a[1, 1] * a[2, 2] - a[1, 2] * a[2, 1]
+    out[0, 1] = a[0, 2] * a[2, 1] - a[0, 1] * a[2, 2]
+    out[0, 2] = a[0, 1] * a[1, 2] - a[0, 2] * a[1, 1]
+    out[1, 1] = a[0, 0] * a[2, 2] - a[0, 2] * a[2, 0]
+    out[1, 2] = a[0, 2] * a[1, 0] - a[0, 0] * a[1, 2]
+    out[2, 2] = a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]
+    det = a[0, 0] * out[0, 0] + a[0, 1] * out[0, 1] + a[0, 2] * out[0, 2]
+    for i in range(3):
+        for j in range(i, 3):
+            out[i, j] /= det
+            out[j, i] = out[i, j]

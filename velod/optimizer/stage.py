@@ -171,7 +171,9 @@ class OptimizerStage:
         self._imu_t_ns = int(t[-1])
 
     def _restart_after_gap(self) -> None:
-        self._estimator = Estimator(self._settings, self._calibration)
+        check = self._estimator.rotation_check
+        check.forget_pending()
+        self._estimator = Estimator(self._settings, self._calibration, check)
         self._estimator.counters = self.counters
         self._was_valid, self._was_lost = False, self._was_valid or self._was_lost
         self._tick = -1
@@ -281,6 +283,8 @@ class OptimizerStage:
         self._check.add_batch(flow, depth)
         if (own := self._estimator.own_solution) is not None and own[0] == flow.t_ns:
             self._check.add_solution(*own)
+        if (offsets := self._estimator.rotation_check.offsets) is not None:
+            self._check.add_offsets(offsets)
 
     def put_out(self, tau: int) -> list[Velocity | Odometry]:
         """The velocity at ``tau`` from what has been taken in; with its dead reckoning where it is valid."""

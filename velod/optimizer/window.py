@@ -36,9 +36,12 @@ NORM_SIGMA = 0.02
 
 _GONE = np.concatenate([np.arange(3), HEAD + np.arange(3, BLOCK)])
 """Columns of what leaves with the oldest segment: its first control point, its biases and its gravity."""
-_SELECTED = np.arange(3, 12)
-COMMON_S = np.array([3.0, 3.0, 100.0])
-"""How long common errors last, s: flow and depth scale change with the scene, the delay hardly does."""
+_SELECTED = np.arange(3, 15)
+COMMON_S = np.array([3.0, 100.0, 100.0])
+"""How long common errors last, s: the flow's scale changes with the scene, delay and depth's scale are the rig's."""
+
+
+NO_COMMON = np.zeros(3)
 
 
 class Solution:
@@ -76,6 +79,7 @@ class Window:
         """
         self._bias_margin = bias_margin
         self._common_sigma = common_sigma
+        self._common_lasts = np.ones(3)
         self._imu = imu
         self._noise_information = BIN_NS * 1e-9 / imu.gyro_noise**2 if shared_gyro_noise else NO_NOISE
         self._knot_ns = knot_ns
@@ -185,8 +189,12 @@ class Window:
 
     def selector(self, t_ns: int) -> F64:
         """F (12, n) with F x = [spline at t_ns, b_a, b_w, g_L of its segment]."""
+        return self.selector_with_common(t_ns)[:12]
+
+    def selector_with_common(self, t_ns: int) -> F64:
+        """F (15, n): ``selector``, and the common errors of the segment."""
         segment, u = locate(t_ns, self._knot_ns)
-        F = np.zeros((12, self.size))
+        F = np.zeros((15, self.size))
         _place_spline(F, segment - self.first, u)
         own = HEAD + BLOCK * (segment - self.first)
         F[_SELECTED, own + _SELECTED] = 1.0
@@ -205,15 +213,23 @@ class Window:
         else:
             self._front = -1
 
-    def shift(self, offset: F64) -> None:
-        """Count the spline from another origin: every control point + offset (3,); the information is the same."""
+    def shift(self, offset: F64, common: F64 = NO_COMMON) -> None:
+        """Count states from another origin: every control point + offset (3,), every common error + ``common`` (3,).
+
+        The information is the same.
+        """
         n = self.size
         change = np.zeros(n)
         for segment in range(self.first, self.last + 1):
             for column in self.control_columns(segment):
                 change[column : column + 3] = offset
+            change[self.common_columns(segment)] = common
         self._h[:n] += self._H[:n, :n] @ change
         self._front = -1
+
+    def begin_common_anew(self, index: int) -> None:
+        """The next segment's common error ``index`` has nothing to do with those before."""
+        self._common_lasts[index] = 0.0
 
     def solve(self, extra: Sequence[Interval], g_prior: F64 | None, g_sigma: float) -> Solution:
         """The optimum with further intervals that are not kept.
@@ -271,7 +287,8 @@ class Window:
 
     def _carry_common(self, dt: float) -> None:
         """The common errors of the newest segment are those of the one before, ``dt`` s earlier, less and less."""
-        kept = np.exp(-dt / COMMON_S)
+        kept = np.exp(-dt / COMMON_S) * self._common_lasts
+        self._common_lasts[:] = 1.0
         J = np.zeros((3, self.size))
         J[np.arange(3), self.common_columns(self.last)] = 1.0
         J[np.arange(3), self.common_columns(self.last - 1)] = -kept
