@@ -5,7 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from velod.events.sae import NEVER, age_unit_ns, encode_ages, encode_newest, gather_patches, new_surface, update_sae
+from velod.events.sae import (
+    CACHED,
+    NEVER,
+    age_unit_ns,
+    encode_ages,
+    encode_newest,
+    gather_patches,
+    new_surface,
+    update_sae,
+)
 
 MS = 1_000_000
 
@@ -40,12 +49,14 @@ def test_the_polarities_have_their_own_surfaces() -> None:
     assert (first[1] == NEVER).all() and (last[1] == NEVER).all()
 
 
-def test_the_kernel_agrees_with_its_plain_twin() -> None:
+@pytest.mark.parametrize("shape", [(8, 9), (400, 500)], ids=["cached", "beyond the cache"])
+def test_the_kernel_agrees_with_its_plain_twin(shape: tuple[int, int]) -> None:
     rng = np.random.default_rng(1)
     n, refractory = 4000, 3000
+    assert (2 * shape[0] * shape[1] > CACHED) == (shape != (8, 9))
     x, y = rng.integers(0, 9, n).astype(np.uint16), rng.integers(0, 8, n).astype(np.uint16)
     t, p = np.sort(rng.integers(0, 500_000, n)), rng.integers(0, 2, n).astype(np.uint8)
-    first, last = new_surface(8, 9), new_surface(8, 9)
+    first, last = new_surface(*shape), new_surface(*shape)
     update_sae(x, y, t, p, first, last, refractory)
     expected: dict[tuple[int, int, int], tuple[int, int]] = {}
     for i in range(n):

@@ -21,6 +21,8 @@ NEVER = -(2**62)
 
 MAX_U16 = 65_535
 
+CACHED = 1 << 18
+"""Stamps of a surface that the second-level cache holds. Of larger ones both are fetched at once."""
 BLOCK = 4096
 """Events that are entered into one surface before the other one's turn comes."""
 
@@ -39,6 +41,14 @@ def update_sae(x: U16, y: U16, t_ns: I64, p: U8, first: I64, last: I64, refracto
     An event sooner than ``refractory_ns`` after the last one of its pixel and polarity belongs to that one's burst
     and updates only ``last``. Coordinates and polarities must have been checked.
     """
+    if last.size > CACHED:
+        for i in range(t_ns.size):
+            k, r, c, t = p[i], y[i], x[i], t_ns[i]
+            if t - last[k, r, c] >= refractory_ns:
+                first[k, r, c] = t
+            last[k, r, c] = t
+        return
+    # One surface at a time: stores into two by turns take twice as long.
     begins = np.empty(min(t_ns.size, BLOCK), np.int32)
     for start in range(0, t_ns.size, BLOCK):
         block = slice(start, start + BLOCK)
@@ -51,7 +61,7 @@ def update_sae(x: U16, y: U16, t_ns: I64, p: U8, first: I64, last: I64, refracto
 def enter_last(x: U16, y: U16, t_ns: I64, p: U8, last: I64, refractory_ns: int, begins: I32) -> int:
     """Enter events, in time order, into ``last`` (2, h, w); writes which of them begin a burst to ``begins`` (n,).
 
-    Returns how many do. One surface at a time: stores into two by turns take more than twice as long.
+    Returns how many do.
     """
     n = 0
     for i in range(t_ns.size):
