@@ -119,7 +119,8 @@ def _fleet(args: argparse.Namespace) -> int:
         raise RunFailed(str(e)) from None
     print(
         f"{fleet.rigs} rigs at {fleet.hz:g} Hz: {fleet.rate_hz:.0f} velocities per second at the consumer"
-        f" ({100 * fleet.share:.1f} %), {fleet.lost} lost, {fleet.silent} rigs not heard; latency p50"
+        f" ({100 * fleet.share:.1f} %), {fleet.lost} lost, {fleet.overflowed} of them in the consumer's"
+        f" queues, {fleet.silent} rigs not heard; latency p50"
         f" {fleet.latency_p50_ms:.2f} ms, p99 {fleet.latency_p99_ms:.2f} ms; cores: router {fleet.router_cores:.2f},"
         f" consumer {fleet.consumer_cores:.2f}, all rigs {fleet.rigs_cores:.2f}; router {fleet.router_mib:.0f} MiB",
         file=_out(args),

@@ -12,11 +12,13 @@ import numpy as np
 import pytest
 
 from velod.cli import main
-from velod.config import DepthSettings, ZenohSettings
+from velod.config import DepthSettings, Settings, ZenohSettings
 from velod.geometry.calibration import save_calibration
 from velod.prove.besieged import free_port
 from velod.runtime import checkup
 from velod.runtime.certificates import make_keys
+from velod.runtime.session import open_session
+from velod.runtime.settings_service import serve
 from velod.runtime.warmup import plain_calibration
 
 
@@ -130,3 +132,12 @@ def test_a_place_that_was_named_has_to_answer(port: int, monkeypatch: pytest.Mon
     there = ZenohSettings(connect=f"tcp/127.0.0.1:{port}")
     finding = checkup.service("rig0", there, expected=True)
     assert finding.state == "FAIL" and "no velod serves rig 'rig0'" in finding.found
+
+
+def test_a_velod_that_answers_is_good(port: int) -> None:
+    with (
+        open_session(ZenohSettings(port=port), introducer=True) as session,
+        serve(session, Settings(), plain_calibration()),
+    ):
+        finding = checkup.service("rig0", ZenohSettings(port, connect=f"tcp/127.0.0.1:{port}"), expected=True)
+    assert (finding.state, finding.found) == ("OK", f"rig rig0 answers at tcp/127.0.0.1:{port}")

@@ -35,6 +35,7 @@ class Fleet:
     rate_hz: float  # of velocities at the consumer
     silent: int  # rigs that it never heard
     lost: int  # by holes in seq
+    overflowed: int  # of these, in the consumer's queues: it was too slow, and kept the newest of each rig
     latency_p50_ms: float  # published to received
     latency_p99_ms: float
     router_cores: float  # CPU seconds per second
@@ -104,7 +105,7 @@ def _tls(stack: ExitStack) -> _Way:
 
 def _measure(listener: Listener, rigs: int, hz: float, seconds: float, router: int, groups: list[int]) -> Fleet:
     _receive(listener, _WARM_UP_S)
-    lost = listener.counters.get("gap.velocity", 0)
+    lost, overflowed = _losses(listener)
     before = [sum(map(cpu_s, pids)) for pids in ([router], groups, [os.getpid()])]
     start_s = time.monotonic()
     latency_ms, heard = _receive(listener, seconds)
@@ -118,13 +119,22 @@ def _measure(listener: Listener, rigs: int, hz: float, seconds: float, router: i
         seconds=elapsed_s,
         rate_hz=len(latency_ms) / elapsed_s,
         silent=rigs - len(heard),
-        lost=listener.counters.get("gap.velocity", 0) - lost,
+        lost=_losses(listener)[0] - lost,
+        overflowed=_losses(listener)[1] - overflowed,
         latency_p50_ms=float(p50),
         latency_p99_ms=float(p99),
         router_cores=of_router,
         rigs_cores=of_rigs,
         consumer_cores=of_consumer,
         router_mib=resident_mib(router),
+    )
+
+
+def _losses(listener: Listener) -> tuple[int, int]:
+    """Velocities that are missing, and those that its queues had no room for."""
+    counters = listener.counters
+    return counters.get("gap.velocity", 0), sum(
+        n for name, n in counters.items() if name.startswith("inbox.overflow")
     )
 
 
