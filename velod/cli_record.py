@@ -28,6 +28,8 @@ SEQUENCE_SUFFIXES, MCAP_SUFFIX = (".h5", ".hdf5"), ".mcap"
 OUTPUTS = (VELOCITY, ODOMETRY, HEALTH)
 MIN_FREE_BYTES = 256 << 20
 """Recording ends while there is room left to close the file, and for everybody else."""
+QUEUE_BYTES = 256 << 20
+"""Of each topic, while the disk is slow: five seconds of 5 Mev/s."""
 _POLL_S = 0.1
 _LOOK_S = 1.0
 
@@ -44,7 +46,7 @@ def record(
         raise ValueError(f"{path}: exists already; velod overwrites no recording")
     chosen = _topics(path, topics)
     place = place_of(config, way, "operator")
-    session = _Session(place, chosen, seconds, stop_on_signals())
+    session = Session(place, chosen, seconds, stop_on_signals())
     if path.suffix in SEQUENCE_SUFFIXES:
         _record_sensors(path, session, _calibration(config, calibration, place))
     else:
@@ -68,7 +70,7 @@ def _topics(path: Path, names: list[str]) -> tuple[Topic, ...]:
 
 
 @dataclass(slots=True)
-class _Session:
+class Session:
     """One recording: takes messages in, shows how far it is, and knows when it is over."""
 
     place: Place
@@ -84,21 +86,27 @@ class _Session:
     def run(self, path: Path, take: Callable[[Received], None]) -> None:
         """Hand every message to ``take`` until it is over."""
         line, next_look_s = Line(), 0.0
-        with Listener(self.place.rig, self.topics, self.place.zenoh) as listener:
+        with Listener(self.place.rig, self.topics, self.place.zenoh, QUEUE_BYTES) as listener:
             while not self._is_over():
                 if (received := listener.receive(_POLL_S)) is not None:
-                    take(received)
-                    self.n, self.n_bytes = self.n + 1, self.n_bytes + received.n_bytes
-                    self.began_s = self.began_s or time.monotonic()
+                    self._hand_over(received, take)
                 if line.due():
                     line.draw(self._progress(listener.counters))
                 if (now_s := time.monotonic()) >= next_look_s:
                     next_look_s = now_s + _LOOK_S
                     self._look_at_disk(path)
+            end_ns = time.time_ns()  # what has come until now may still wait in the queue
+            while (received := listener.receive(0.0)) is not None and received.t_received_ns <= end_ns:
+                self._hand_over(received, take)
             self.lost = _losses(listener.counters)
         line.finish()
         if not self.n:
             raise RunFailed(f"nothing came from rig {self.place.rig} ({self.place.connect})")
+
+    def _hand_over(self, received: Received, take: Callable[[Received], None]) -> None:
+        take(received)
+        self.n, self.n_bytes = self.n + 1, self.n_bytes + received.n_bytes
+        self.began_s = self.began_s or time.monotonic()
 
     def report(self, path: Path) -> int:
         """Say what was recorded and what is missing; the exit code."""
@@ -137,7 +145,7 @@ def _megabytes(n: float) -> str:
     return f"{n / 1e6:.1f} MB"
 
 
-def _record_sensors(path: Path, session: _Session, calibration: Calibration | None) -> None:
+def _record_sensors(path: Path, session: Session, calibration: Calibration | None) -> None:
     beside = path.with_suffix(".yaml")
     try:
         log = SensorLog(path, calibration)
@@ -153,7 +161,7 @@ def _record_sensors(path: Path, session: _Session, calibration: Calibration | No
         log.finish()
 
 
-def _record_mcap(path: Path, session: _Session) -> None:
+def _record_mcap(path: Path, session: Session) -> None:
     try:
         from velod.io.mcap_log import McapLog
     except ImportError:

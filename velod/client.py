@@ -9,6 +9,7 @@
 from __future__ import annotations
 
 import math
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -60,15 +61,18 @@ class Listener(Stacked):
     """Messages of any topics of one rig, or of all (``"*"``). A context manager; nothing is received outside it.
 
     The connection is made, and made again after a loss, in the background. Each topic keeps the newest
-    ``topic.qos.depth`` messages. To enter it raises velod.runtime.session.SessionError: endpoint malformed,
-    certificate or role of no use, refused.
+    ``topic.qos.depth`` messages; with ``queue_bytes``, for those who must miss none, as many as so many bytes hold.
+    To enter it raises velod.runtime.session.SessionError: endpoint malformed, certificate or role of no use, refused.
     """
 
-    def __init__(self, rig: str, topics: tuple[Topic, ...], settings: ZenohSettings) -> None:
+    def __init__(
+        self, rig: str, topics: tuple[Topic, ...], settings: ZenohSettings, queue_bytes: int | None = None
+    ) -> None:
         self._refused: dict[str, int] = {}
         self._rig = rig
         self._topics = {t.name: t for t in topics}
         self._settings = settings
+        self._queue_bytes = queue_bytes
         self._inbox = Inbox()
         self._gaps: dict[tuple[str, str], GapCounter] = {}  # by topic and key
         self._session: Any = None
@@ -96,7 +100,8 @@ class Listener(Stacked):
                 rig = parts(topic, at)["rig"]
                 source = topic.name if self._rig != ANY_RIG else f"{topic.name}{_OF}{rig}"
                 if source not in sources.values():
-                    self._inbox.add_source(source, topic.qos.depth)
+                    depth = topic.qos.depth if self._queue_bytes is None else sys.maxsize
+                    self._inbox.add_source(source, depth, max_bytes=self._queue_bytes)
                 sources[at] = source
             self._inbox.put(source, at, sample.payload.to_bytes())
 

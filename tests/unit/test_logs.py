@@ -4,14 +4,21 @@ from __future__ import annotations
 
 import json
 import math
+import time
 from dataclasses import replace
 from pathlib import Path
+from threading import Event
+from typing import ClassVar, Self
 
 import numpy as np
 import pytest
 from mcap.reader import make_reader
 
 from tests import slanted_scene
+from velod import cli_record
+from velod.cli_watch import Place
+from velod.client import Received
+from velod.config import ZenohSettings
 from velod.io import RecordingError, open_recording
 from velod.io.live import SensorLog
 from velod.io.mcap_log import McapLog
@@ -19,6 +26,7 @@ from velod.io.packets import Chunking
 from velod.io.sequence import RecordingWriter
 from velod.types import DepthBatch, EventPacket, Health, ImuPacket, Velocity
 from velod.wire import Envelope, decode, encode
+from velod.wire.topics import VELOCITY
 
 T = 1_000_000_000
 
@@ -125,3 +133,38 @@ def test_small_messages_are_json_that_keeps_its_schema_and_others_the_bytes_of_t
     assert json.loads(found["velod/r/health/flow-0"][2].data)["counters"] == {"in": 4}
     assert found["velod/r/depth"][2].data == encode(depth(), 7, 2)
     assert decode(found["velod/r/depth"][2].data).message.seq == 3
+
+
+class Queue:
+    """In place of a listener: messages that wait already, and one that comes after the end."""
+
+    counters: ClassVar[dict[str, int]] = {}
+
+    def __init__(self, waiting: int) -> None:
+        now_ns = time.time_ns()
+        late_ns = now_ns + 3_600_000_000_000
+        self._items = [
+            Received(VELOCITY, "velod/r/velocity", Envelope(velocity(), 1, 0), t_ns, 100)
+            for t_ns in (*[now_ns] * waiting, late_ns)
+        ]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        pass
+
+    def receive(self, timeout_s: float) -> Received | None:
+        return self._items.pop(0) if self._items else None
+
+
+def test_what_waits_in_the_queue_when_recording_ends_is_recorded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cli_record, "Listener", lambda *_: Queue(waiting=5))
+    stop = Event()
+    stop.set()
+    session = cli_record.Session(Place("r", ZenohSettings()), (VELOCITY,), None, stop)
+    taken: list[Received] = []
+    session.run(tmp_path / "run.mcap", taken.append)
+    assert len(taken) == session.n == 5
