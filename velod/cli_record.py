@@ -87,6 +87,7 @@ class Session:
         """Hand every message to ``take`` until it is over."""
         line, next_look_s = Line(), 0.0
         with Listener(self.place.rig, self.topics, self.place.zenoh, QUEUE_BYTES) as listener:
+            print(f"recording rig {self.place.rig} ({self.place.connect}); Ctrl-C ends", file=sys.stderr, flush=True)
             while not self._is_over():
                 if (received := listener.receive(_POLL_S)) is not None:
                     self._hand_over(received, take)
@@ -128,7 +129,7 @@ class Session:
 
     def _progress(self, counters: dict[str, int]) -> str:
         if not self.n:
-            return f"waiting for rig {self.place.rig} ({self.place.connect}); Ctrl-C ends"
+            return "nothing has come yet"
         elapsed_s = time.monotonic() - self.began_s
         return (
             f"{elapsed_s:7.1f} s  {self.n} messages  {_megabytes(self.n_bytes)}"

@@ -60,7 +60,8 @@ def test_a_rig_that_sends_nothing_leaves_no_file(port: int, tmp_path: Path) -> N
         stderr=subprocess.PIPE,
         text=True,
     ) as recorder:
-        time.sleep(3.0)
+        assert recorder.stderr is not None
+        assert recorder.stderr.readline().startswith("recording rig rig0")
         recorder.send_signal(signal.SIGTERM)
         _, said = recorder.communicate(timeout=20.0)
     assert recorder.returncode == 1
