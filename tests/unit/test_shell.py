@@ -6,6 +6,7 @@ import socket
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
+from dataclasses import replace
 from threading import Event, Thread
 from typing import Any
 
@@ -166,6 +167,23 @@ def test_a_velocity_carries_the_origin_of_the_batch_it_used(session: zenoh.Sessi
         bench.outlet.publish(IMU, ImuSamples(0, 0, 0, 2, 1002, np.zeros(0, np.int64), nothing, nothing))
         (out,) = bench.wait_for(VELOCITY, 1)
     assert out.t_origin_ns == 101
+
+
+def test_a_velocity_is_as_old_as_its_sample_however_long_that_waited_to_be_handled(session: zenoh.Session) -> None:
+    """A process that has just started has work waiting, and must not take that for the way from the sensor."""
+
+    def answer(samples: ImuSamples) -> Sequence[Message]:
+        time.sleep(0.3)
+        return [replace(velocity(0, 0), t_ns=samples.t_ns)]
+
+    nothing = np.zeros((0, 3))
+    with Bench(session, "optimizer", FakeStage(answer)) as bench:
+        for seq in range(2):
+            at = ImuSamples(seq, time.time_ns(), 0, -1, 0, np.zeros(0, np.int64), nothing, nothing)
+            bench.outlet.publish(IMU, at)
+        first, second = bench.wait_for(VELOCITY, 2)
+    assert first.message.age_ms >= 290.0
+    assert second.message.age_ms >= 590.0
 
 
 def test_health_tells_counters_gaps_rates_and_alarms(session: zenoh.Session) -> None:

@@ -37,6 +37,8 @@ MAX_DEATH_MIB, MAX_DEATH_FILES = 8.0, 3.0
 """Of every other process, for each worker that was killed. Measured: 1 to 4 MiB, 1 or 2 files."""
 MAX_DRIFT, MAX_DRIFT_SHORT = 1.5, 3.0
 """Median latency of the last third over that of the middle one; of a shorter run, which others may disturb."""
+MAX_GAP_S = 2 * STOPPED_S
+"""Without a velocity: a process was stopped for STOPPED_S, or one that died had no spare and took as long to load."""
 _ANY, _STATELESS = ("ingest-0", "flow-0", "depth-0", "optimizer-0"), ("flow-0", "depth-0")
 
 
@@ -99,6 +101,8 @@ class Soak:
             found.append(f"latency rose from {self.latency_middle_ms:.1f} to {self.latency_last_ms:.1f} ms")
         if not self.served:
             found.append("no velocity came")
+        elif self.longest_gap_s > MAX_GAP_S:
+            found.append(f"no velocity for {self.longest_gap_s:.1f} s")
         return found
 
 

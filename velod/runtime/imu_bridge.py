@@ -21,8 +21,8 @@ from velod.wire import WireError, decode
 
 SILENT_S: Final = 0.05
 """Without samples from ingest for so long it is not waited for: as long as the optimizer waits for a batch."""
-KEPT: Final = 128
-"""Packets of the sensor: twice SILENT_S and more, at a packet for each sample of 1 kHz."""
+KEPT: Final = 512
+"""Packets of the sensor, half a second of single samples at 1 kHz: ingest may be behind when it dies."""
 
 
 class ImuBridge:

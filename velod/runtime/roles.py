@@ -280,7 +280,7 @@ class OptimizerShell(WorkerShell):
         message = cause.message
         if isinstance(message, ImuSamples):
             # By this host's clock, like the age below: ingest may run on another one.
-            self._clock.heard(max(message.t_ns, message.event_t_ns), time.time_ns())
+            self._clock.heard(max(message.t_ns, message.event_t_ns), self.arrived_ns)
         if isinstance(message, FlowBatch | DepthBatch):
             self._origin_ns[message.seq, message.t_ns] = cause.t_origin_ns
             if len(self._origin_ns) > self._REMEMBERED:

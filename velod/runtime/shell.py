@@ -64,6 +64,7 @@ class WorkerShell:
         self._heard: dict[str, tuple[Topic, float]] = {}  # by key: when the last message came
         self._logged: set[str] = set()
         self._t_ns = 0
+        self.arrived_ns = 0  # host clock, when what is being handled came in; it may have waited since
 
     def run(self, stop: Event) -> None:
         """Handle messages until ``stop`` is set; then leave nothing declared."""
@@ -193,6 +194,7 @@ class WorkerShell:
 
     def _take(self, item: Item) -> None:
         """One item of the inbox, whatever it is; nothing that is wrong with it gets further than here."""
+        self.arrived_ns = item.t_ns
         try:
             if item.source == _TOKENS:
                 self.token_changed(parts(ALIVE, item.key), is_there=item.data == _CAME)
