@@ -156,11 +156,11 @@ def test_sigmas_agree_with_their_numpy_twin() -> None:
     for k, i in enumerate(out.index):
         age = np.empty(49)
         age[CORE], age[~CORE] = message.patch[i] * 1e-9, message.ring[i] * 1e-9
-        fit, bend = widen_plane(fit_plane(age[CORE], 1.0, 2, 20), age, 1.0, 0.35)
-        n, gx, gy, _, rms, qxx, qxy, qyy = fit
+        fit, bend, slope_rms = widen_plane(fit_plane(age[CORE], 1.0, 2, 20), age, 1.0, 0.35)
+        n, gx, gy, _, _, qxx, qxy, qyy = fit
         q, normal = np.array([[qxx, qxy], [qxy, qyy]]), np.array([gx, gy]) / np.hypot(gx, gy)
         edge = np.array([-normal[1], normal[0]])
-        share = INFLATION * honest_rms(n, rms, np.hypot(gx, gy)) / np.hypot(gx, gy)
+        share = INFLATION * honest_rms(n, slope_rms, np.hypot(gx, gy)) / np.hypot(gx, gy)
         along, turn = (share * np.sqrt(v @ q @ v) for v in (normal, edge))
         along = np.hypot(along, BEND_PX * bend / np.hypot(gx, gy))
         expected = np.sqrt((b[k] * along) ** 2 + turn**2 * ((edge @ [ux[k], uy[k]]) ** 2 + unknown))

@@ -119,7 +119,7 @@ def test_the_widened_plane_agrees_with_its_numpy_twin(seed: int) -> None:
     age[~CORE & (rng.random(49) < 0.2)] = 0.0
     age[~CORE & (rng.random(49) < 0.2)] += 0.02
     fit = fit_plane(age[CORE], 1.0, 2, 20)
-    got, _ = widen_plane(fit, age, 1.0, 0.35)
+    got, *_ = widen_plane(fit, age, 1.0, 0.35)
     assert got == pytest.approx(widened_twin(fit, age, 1.0), rel=1e-7, abs=1e-13)
     assert 25 < got[0] < 49
 
@@ -127,7 +127,7 @@ def test_the_widened_plane_agrees_with_its_numpy_twin(seed: int) -> None:
 def test_another_edge_around_a_plane_does_no_harm() -> None:
     age = noisy_wide_ages(1, noise_px=0.0)
     age[WIDE_DX > 2] -= 0.02
-    got, _ = widen_plane(fit_plane(age[CORE], 1.0, 2, 20), age, 1.0, 0.35)
+    got, *_ = widen_plane(fit_plane(age[CORE], 1.0, 2, 20), age, 1.0, 0.35)
     assert got[0] == 42
     assert np.hypot(got[1], got[2]) == pytest.approx(2e-3, rel=1e-9)
 
@@ -137,7 +137,7 @@ def test_what_is_no_plane_in_the_wide_stays_as_it_was_found() -> None:
     rng = np.random.default_rng(2)
     age[~CORE] += rng.choice([-1.0, 1.0], 24) * 0.9 * 2e-3
     fit = fit_plane(age[CORE], 1.0, 2, 20)
-    assert widen_plane(fit, age, 1.0, 0.35) == (fit, 0.0)
+    assert widen_plane(fit, age, 1.0, 0.35) == (fit, 0.0, fit[4])
     assert widen_plane(fit, age, 1.0, 0.9)[0] != fit
 
 
@@ -150,8 +150,23 @@ def test_a_bend_along_the_slope_is_told_and_one_along_the_edge_is_none(seed: int
     across = np.array([-normal[1], normal[0]]) @ [WIDE_DX, WIDE_DY]
     for way, told in ((along, 1.0), (across, 0.0)):
         age = flat - 5e-5 * way**2
-        _, bend = widen_plane(fit_plane(age[CORE], 1.0, 2, 20), age, 2.0, 0.9)
+        _, bend, slope_rms = widen_plane(fit_plane(age[CORE], 1.0, 2, 20), age, 2.0, 0.9)
         assert bend == pytest.approx(told * 5e-5, abs=0.25 * 5e-5)
+        assert slope_rms < 1e-9, "no bend moves the slope"
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_what_the_slope_errs_by_follows_from_the_residuals_of_a_fit_with_bends(seed: int) -> None:
+    age = noisy_wide_ages(seed)
+    fit, _, slope_rms = widen_plane(fit_plane(age[CORE], 1.0, 2, 20), age, 1.0, 0.35)
+    assert fit[0] == 49
+    x, y = WIDE_DX.astype(float), WIDE_DY.astype(float)
+    bent = np.column_stack([np.ones(49), x, y, x * x, x * y, y * y])
+    (rss,) = np.linalg.lstsq(bent, -age, rcond=None)[1]
+    assert slope_rms == pytest.approx(np.sqrt(rss / 49 * 46 / 43), rel=1e-6)
+    age[0] = 0.0
+    fit, _, slope_rms = widen_plane(fit_plane(age[CORE], 1.0, 2, 20), age, 1.0, 0.35)
+    assert slope_rms == fit[4], "with a neighbour missing a bend does move the slope"
 
 
 def test_widening_halves_the_scatter_of_the_slope() -> None:

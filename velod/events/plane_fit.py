@@ -150,15 +150,16 @@ def fit_plane(
 @njit(fastmath=ANY_ORDER, cache=True, nogil=True, error_model="numpy")
 def widen_plane(
     fit: PlaneFit, age: F64, reject_px: float, max_rms_px: float, time_noise_s: float = 0.0
-) -> tuple[PlaneFit, float]:
+) -> tuple[PlaneFit, float, float]:
     """The plane through those of the 7x7 neighbours that lie within ``reject_px`` of ``fit``, or in its time noise.
 
     ``age``: (49,) float64, row-major 7x7 patch, as that of ``fit_plane``; ``fit`` has been found in its middle.
-    Returns what ``fit_plane`` does, and by how much the residuals bend along the slope, s/px^2 (>= 0, half the second
-    derivative; as if no neighbour were missing). ``fit`` itself and 0 where the new plane is near-singular or its
-    ``rms_px`` not below ``max_rms_px``.
+    Returns what ``fit_plane`` does; by how much the residuals bend along the slope, s/px^2 (>= 0, half the second
+    derivative; as if no neighbour were missing); and the rms residual from which errors of the slope follow, s: where
+    no neighbour is missing without bends, which are even and leave the slope alone. ``fit`` itself, 0 and its rms
+    where the new plane is near-singular or its ``rms_px`` not below ``max_rms_px``.
     """
-    _, gx, gy, t0, _, _, _, _ = fit
+    _, gx, gy, t0, fit_rms, _, _, _ = fit
     limit = _reach_s(reject_px, gx * gx + gy * gy, time_noise_s)
     # Moments of the residuals: what the slope and the time of the new plane differ by follows from them.
     n = x = y = xx = xy = yy = 0.0
@@ -182,13 +183,13 @@ def widen_plane(
         xyr += dx * dy * kr
         yyr += dy * dy * kr
     if n < 4:
-        return fit, 0.0
+        return fit, 0.0, fit_rms
     mx, my, mr = x / n, y / n, r / n
     sxx, sxy, syy = xx - x * mx, xy - x * my, yy - y * my
     sxr, syr = xr - x * mr, yr - y * mr
     det = sxx * syy - sxy * sxy
     if det <= MIN_DETERMINANT * sxx * syy:
-        return fit, 0.0
+        return fit, 0.0, fit_rms
     hx = (syy * sxr - sxy * syr) / det
     hy = (sxx * syr - sxy * sxr) / det
     gx += hx
@@ -196,11 +197,16 @@ def widen_plane(
     rms = math.sqrt(max(rr - r * mr - hx * sxr - hy * syr, 0.0) / n)
     slope2 = gx * gx + gy * gy
     if not rms_px(rms, slope2, time_noise_s) < max_rms_px:
-        return fit, 0.0
+        return fit, 0.0, fit_rms
     # On the full grid x^2, x y and y^2 are orthogonal to the plane (but for their means) and to each other.
     a, b, c = (xxr - 4.0 * r) / 588.0, (yyr - 4.0 * r) / 588.0, xyr / 784.0
     bend = abs(gx * gx * a + gy * gy * b + gx * gy * c) / slope2
-    return (int(n), gx, gy, t0 + mr - hx * mx - hy * my, rms, syy / det, -sxy / det, sxx / det), bend
+    slope_rms = rms
+    if n == WIDE_SIZE:
+        odd = max(n * rms * rms - 588.0 * (a * a + b * b) - 784.0 * c * c, 0.0)
+        slope_rms = math.sqrt(odd / n * (n - 3) / (n - 6))  # the bends are three parameters more
+    widened = (int(n), gx, gy, t0 + mr - hx * mx - hy * my, rms, syy / det, -sxy / det, sxx / det)
+    return widened, bend, slope_rms
 
 
 @njit(cache=True, nogil=True)

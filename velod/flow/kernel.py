@@ -62,13 +62,13 @@ def fit_flows(
         if fit[0] == 0:
             refused[_UNFIT] += 1
             continue
-        bend = 0.0
+        bend, slope_rms = 0.0, fit[4]
         if len(ring) > 0:
             for j in range(SIZE):
                 wide[INNER_AT[j]] = age[j]
             for j in range(RING):
                 wide[RING_AT[j]] = ring[i, j] * 1e-9
-            fit, bend = widen_plane(fit, wide, reject_px, max_rms_px, time_noise_s)
+            fit, bend, slope_rms = widen_plane(fit, wide, reject_px, max_rms_px, time_noise_s)
         n, gx, gy, _, rms, qxx, qxy, qyy = fit
         slope = math.sqrt(gx * gx + gy * gy)
         if not rms_px(rms, slope * slope, time_noise_s) < max_rms_px:
@@ -90,7 +90,7 @@ def fit_flows(
         # Eq. 6: the normal flow is grad_T / |grad_T|^2.
         nx, ny, speed = tx / grad_T, ty / grad_T, 1.0 / grad_T
         # Variances of the slope along n and across it, as shares of the slope: errors of speed and of direction.
-        sigma_t = INFLATION * honest_rms(n, rms, slope, time_noise_s)
+        sigma_t = INFLATION * honest_rms(n, slope_rms, slope, time_noise_s)
         along = math.hypot(
             speed * sigma_t * _deviation(qxx, qxy, qyy, a * nx + d * ny, b * nx + e * ny),
             BEND_PX * bend / slope,
