@@ -37,6 +37,7 @@ MAX_OFF_CENTRE = 0.2
 _MIB = 1 << 20
 _UNSYNCHRONISED = 5
 """What adjtimex(2) returns while nothing keeps the clock: TIME_ERROR."""
+_FOR_DEVELOPERS = ("test", "check", "fuzz")
 _IMPORT_NAMES = {"eclipse-zenoh": "zenoh", "opencv-python-headless": "cv2", "PyYAML": "yaml"}
 
 
@@ -67,7 +68,8 @@ def packages() -> list[Finding]:
     for requirement in metadata.requires("velod") or []:
         name = re.split(r"[^A-Za-z0-9_.-]", requirement)[0]
         if extra := re.search(r"extra == ['\"](\w+)['\"]", requirement):
-            extras.add((extra[1], _is_installed(name)))
+            if extra[1] not in _FOR_DEVELOPERS:
+                extras.add((extra[1], _is_installed(name)))
             continue
         try:
             importlib.import_module(_IMPORT_NAMES.get(name, name))
