@@ -54,7 +54,7 @@ def noise_variance(slope2: F64, variance: F64) -> float:
     is usual, so that planes of one slope alone do not pass for noise.
     """
     order = np.argsort(slope2)
-    groups = [(np.median(slope2[k]), np.median(variance[k])) for k in np.array_split(order, GROUPS)]
+    groups = [(_middle(slope2[k]), _middle(np.sort(variance[k]))) for k in np.array_split(order, GROUPS)]
     s, q = np.array(groups).T
     q *= MEDIAN_OF_VARIANCE
     # min over (a, k) of |(a + k s) / q - 1|^2
@@ -67,6 +67,12 @@ def noise_variance(slope2: F64, variance: F64) -> float:
     if k < usual:
         a = (a1 - usual * ak) / aa
     return max(float(a), 0.0)
+
+
+def _middle(ascending: F64) -> float:
+    """The median of sorted numbers; ``np.median`` takes ten times as long for so few."""
+    n = len(ascending)
+    return 0.5 * float(ascending[(n - 1) // 2] + ascending[n // 2])
 
 
 @njit(cache=True, nogil=True)
