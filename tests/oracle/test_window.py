@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pyceres
 import pytest
 from scipy.optimize import least_squares
 
@@ -190,8 +191,12 @@ def test_an_interval_adds_imu_and_flows_with_their_noise_marginalised_as_dense_a
     assert np.allclose(dense(w)[1] - h, more_h, atol=1e-9 * scale)
 
 
-def test_scipy_reaches_the_same_minimum_of_the_same_cost():
-    """All rows one by one, the gyroscope's noise of every bin as an unknown: weights fixed, nothing compressed."""
+@pytest.fixture
+def whole_cost():
+    """A window's solution; residuals of all rows one by one, in its states and the noise of every bin; A; n states.
+
+    Weights are fixed, nothing is compressed or marginalised; the residuals are A z - residuals(0).
+    """
     rng = np.random.default_rng(12)
     w = filled(4, rng)
     H, h = dense(w)
@@ -217,10 +222,43 @@ def test_scipy_reaches_the_same_minimum_of_the_same_cost():
 
     zero = np.zeros(n + interval.noise.shape[1])
     A = np.column_stack([residuals(unit) - residuals(zero) for unit in np.eye(len(zero))])
+    return w.solve([interval], None, 0.0).x.copy(), residuals, A, n
+
+
+def in_sigmas(difference, A, n):
+    return np.abs(difference / np.sqrt(np.diag(np.linalg.inv(A.T @ A)))[:n]).max()
+
+
+def test_scipy_reaches_the_same_minimum_of_the_same_cost(whole_cost):
+    ours, residuals, A, n = whole_cost
+    zero = np.zeros(A.shape[1])
     peer = least_squares(residuals, zero, jac=lambda _: A, x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-15)
-    ours = w.solve([interval], None, 0.0)
-    sigma = np.sqrt(np.diag(np.linalg.inv(A.T @ A)))[:n]
-    assert np.abs((ours.x - peer.x[:n]) / sigma).max() < 1e-6
+    assert in_sigmas(ours - peer.x[:n], A, n) < 1e-6
+
+
+def test_ceres_reaches_the_same_minimum_of_the_same_cost(whole_cost):
+    ours, residuals, A, n = whole_cost
+
+    class Cost(pyceres.CostFunction):
+        def __init__(self):
+            super().__init__()
+            self.set_num_residuals(A.shape[0])
+            self.set_parameter_block_sizes([A.shape[1]])
+
+        def Evaluate(self, parameters, out, jacobians):
+            out[:] = residuals(np.asarray(parameters[0]))
+            if jacobians is not None:
+                jacobians[0][:] = A.ravel()
+            return True
+
+    z, problem, options = np.zeros(A.shape[1]), pyceres.Problem(), pyceres.SolverOptions()
+    cost = Cost()
+    problem.add_residual_block(cost, None, [z])
+    options.linear_solver_type = pyceres.LinearSolverType.DENSE_QR
+    options.max_num_iterations = 200
+    options.function_tolerance = options.gradient_tolerance = options.parameter_tolerance = 1e-16
+    pyceres.solve(options, problem, pyceres.SolverSummary())
+    assert in_sigmas(ours - z[:n], A, n) < 1e-6
 
 
 def test_both_splines_tell_the_same_of_a_motion_that_both_can_represent():
