@@ -76,7 +76,7 @@ def test_a_low_contrast_threshold_spoils_no_flow(record: Record) -> None:
     """At 0.15 an edge fires three times as many events a pixel; the first of each burst counts."""
     recipe = sequence("boxes-4")
     recipe = replace(recipe, events=replace(recipe.events, threshold=0.15))
-    flow = judged(record(recipe, 0.2), Settings()).flow
+    flow = judged(record(recipe, 0.12), Settings()).flow
     assert flow.n > 2000
     assert abs(flow.bias) < 0.005
     assert flow.spread < 0.03
