@@ -245,6 +245,11 @@ class Estimator:
         return self._weak_L @ head.R_LB @ self._carry(head, t_ns)[0].R_gamma
 
     @property
+    def biases_as_specified(self) -> bool:
+        """Whether no bias has been found that was not drawn with its sigma."""
+        return self._bias_margin == 1.0
+
+    @property
     def dark(self) -> bool:
         """Whether the sensor moves and sees nothing."""
         return self._standstill.dark

@@ -334,7 +334,9 @@ class OptimizerStage:
             if self._estimator.batches < MIN_BATCHES:
                 return state, f"{self._estimator.batches} usable batches", False
             seen_ns = tau - self._estimator.first_usable_t_ns
-            factor = EARLY_FACTOR if seen_ns < EARLY_NS else 1.0 if seen_ns < LATE_NS else LATE_FACTOR
+            # nothing may speak against IMU or calibration: what is uncertain for that is wrong
+            late = seen_ns >= LATE_NS and not self._was_lost and self._estimator.biases_as_specified
+            factor = EARLY_FACTOR if seen_ns < EARLY_NS else LATE_FACTOR if late else 1.0
             if sigma > limit * factor:
                 return state, self._uncertain(tau, sigma), False
             self._was_valid, self._was_lost = True, False
