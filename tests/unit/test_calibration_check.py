@@ -14,14 +14,16 @@ from velod.config import OptimizerSettings, Settings
 from velod.depth.stage import DepthStage
 from velod.flow.stage import FlowStage
 from velod.geometry.calibration import Calibration
+from velod.geometry.rectify import rectify
 from velod.ingest.stage import IngestStage
 from velod.io import open_recording
 from velod.optimizer.calibration_check import CLOCK, EVERY, ROWS, SCALE, CalibrationCheck
 from velod.optimizer.scale_check import SPAN_S, ScaleCheck
 from velod.optimizer.stage import OptimizerStage
-from velod.optimizer.stereo_check import MIN_BATCHES, NEAR_PX, StereoCheck, _neighbours, _robust_sums
+from velod.optimizer.stereo_check import MIN_BATCHES, MOTION_SHARE, NEAR_PX, StereoCheck, _neighbours, _robust_sums
 from velod.types import DepthBatch, EventBatch, EventPacket, FlowBatch, StereoBatch
 
+CAMERA = (260.0, 173.0, 130.0)
 DATA = Path(__file__).parents[3] / "shared" / "data"
 
 
@@ -29,9 +31,11 @@ DATA = Path(__file__).parents[3] / "shared" / "data"
 
 
 def stereo_edges(
-    seq: int, flow_px_s: np.ndarray, clock_s: float, row_px: float, noise: float = 1.0
+    seq: int, flow_px_s: np.ndarray, clock_s: float, row_px: float, parallax_hz: float = 0.0, slant: float = 0.02
 ) -> tuple[FlowBatch, DepthBatch]:
-    """Short edges that lean every way, on a slanted wall that moves by ``flow_px_s``.
+    """Short edges that lean every way, on a slanted wall that moves by ``flow_px_s``, and sideways in space besides.
+
+    ``parallax_hz``: that motion over the disparity. ``slant``: slope of the disparity along a row.
 
     Each is matched where, at the left event's time by the right clock, it crosses the row in the right image.
     """
@@ -40,15 +44,16 @@ def stereo_edges(
     at = rng.uniform([20.0, 20.0], [320.0, 240.0], (m, 2))
     angle = rng.uniform(-1.2, 1.2, m)
     n = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    n *= np.sign(n @ flow_px_s)[:, None]
-    speed = n @ flow_px_s
-    true_px = 15.0 + 0.02 * at[:, 0] + 0.01 * at[:, 1]
+    true_px = 15.0 + slant * at[:, 0] + 0.01 * at[:, 1]
+    motion = flow_px_s + parallax_hz * np.stack([true_px, np.zeros(m)], axis=1)
+    n *= np.sign(np.sum(n * motion, axis=1))[:, None]
+    speed = np.sum(n * motion, axis=1)
     # The right image shows the edge as it was clock_s ago, row_px lower: it is the line n . (p - p0) = 0.
-    p0 = at - np.stack([true_px, np.zeros(m)], axis=1) - flow_px_s * clock_s + [0.0, row_px]
+    p0 = at - np.stack([true_px, np.zeros(m)], axis=1) - motion * clock_s + [0.0, row_px]
     crossing_x = p0[:, 0] - n[:, 1] / n[:, 0] * (at[:, 1] - p0[:, 1])
     f32 = np.float32
-    disparity = at[:, 0] - crossing_x + noise * rng.normal(0.0, 0.05, m) / np.abs(n[:, 0])
-    measured = speed * (1.0 + noise * rng.normal(0.0, 0.02, m))
+    disparity = at[:, 0] - crossing_x + rng.normal(0.0, 0.05, m) / np.abs(n[:, 0])
+    measured = speed * (1.0 + rng.normal(0.0, 0.02, m))
     index = np.arange(m, dtype=np.uint16)
     x, y = at.astype(f32).T
     flow = FlowBatch(
@@ -60,7 +65,7 @@ def stereo_edges(
 
 
 def seen(clock_s: float, row_px: float, flows: list[tuple[float, float]]) -> StereoCheck:
-    check = StereoCheck()
+    check = StereoCheck(CAMERA)
     for seq in range(2 * MIN_BATCHES):
         check.add(*stereo_edges(seq, np.array(flows[seq % len(flows)]), clock_s, row_px))
     return check
@@ -83,8 +88,19 @@ def test_a_slide_along_the_rows_says_nothing_of_the_clocks_but_all_of_the_rows()
     assert offsets.row_px == pytest.approx(0.5, abs=0.05)
 
 
+def test_what_is_nearer_is_faster_as_well_and_passes_for_no_clock() -> None:
+    check = StereoCheck(CAMERA)
+    for seq in range(2 * MIN_BATCHES):
+        motion = np.array([-100.0, (-80.0, 90.0)[seq % 2]])
+        check.add(*stereo_edges(seq, motion, 0.0, 0.0, parallax_hz=12.0, slant=0.12))
+    offsets = check.offsets()
+    assert offsets is not None
+    assert abs(offsets.clock_s) < 2e-4
+    assert offsets.clock_sigma_s < 3e-4
+
+
 def test_few_batches_say_nothing() -> None:
-    check = StereoCheck()
+    check = StereoCheck(CAMERA)
     for seq in range(MIN_BATCHES - 1):
         check.add(*stereo_edges(seq, np.array([300.0, 200.0]), 0.003, 0.0))
     assert check.offsets() is None
@@ -94,18 +110,20 @@ def test_the_kernels_are_their_plain_twins() -> None:
     flow, depth = stereo_edges(1, np.array([200.0, 150.0]), 0.002, 0.4)
     x, y, n = flow.x.astype(float), flow.y.astype(float), flow.n.astype(float)
     u, d = flow.speed / n[:, 0], depth.disparity.astype(float)
-    sigma_u = 0.02 * np.abs(u)
+    per_px, root = 0.3 * u / d, np.random.default_rng(1).normal(0.0, 1.0, (len(x), 6))
     rows = np.empty((4096, 5))
-    rows = rows[: _neighbours(x, y, n, d, u, sigma_u, rows)]
+    rows = rows[: _neighbours(x, y, n, d, per_px, 0.7 * u, root, rows)]
     i, j = np.tril_indices(len(x), -1)
     near = (np.abs(x[i] - x[j]) < NEAR_PX) & (np.abs(y[i] - y[j]) < NEAR_PX)
     i, j, lean = i[near], j[near], n[:, 1] / n[:, 0]
     shape = np.hypot(1.0 / n[i, 0], 1.0 / n[j, 0])
-    twin = np.stack([d[i] - d[j], u[i] - u[j], lean[j] - lean[i], shape, sigma_u[i] ** 2 + sigma_u[j] ** 2], axis=1)
+    at_one_depth = 0.7 * (u[i] - u[j]) + (d[i] + d[j]) / 2 * (per_px[i] - per_px[j])
+    noise2 = np.sum((root[i] - root[j]) ** 2, axis=1) + (MOTION_SHARE * (0.7 * u[i] + d[i] * per_px[i])) ** 2
+    twin = np.stack([d[i] - d[j], at_one_depth, lean[j] - lean[i], shape, noise2], axis=1)
     np.testing.assert_allclose(rows, twin, rtol=1e-12, atol=1e-12)
 
     H, h, solution = np.zeros((2, 2)), np.zeros(2), np.zeros(2)
-    noise = _robust_sums(rows, H, h)
+    noise, weight = _robust_sums(rows, H, h)
     for _ in range(5):
         size = np.abs(twin[:, 0] - twin[:, 1:3] @ solution) / shape
         scale = 2.0 * np.median(size)
@@ -115,16 +133,22 @@ def test_the_kernels_are_their_plain_twins() -> None:
     np.testing.assert_allclose(H, H_twin, rtol=1e-9)
     np.testing.assert_allclose(h, h_twin, rtol=1e-9, atol=1e-9)
     assert noise == pytest.approx(float(w @ twin[:, 4]))
+    assert weight == pytest.approx(float(w.sum()))
 
 
 # --- on recordings that velod did not make
+
+
+def camera_of(calibration: Calibration) -> tuple[float, float, float]:
+    rect = rectify(calibration)
+    return rect.f, rect.cx, rect.cy
 
 
 def front_end(path: Path, late_ns: int = 0, calibration: Calibration | None = None) -> CalibrationCheck:
     """The check over a whole recording, whose right camera is ``late_ns`` late."""
     recording = open_recording(path, calibration=calibration)
     ingest, flow, depth = (s(Settings(), recording.calibration) for s in (IngestStage, FlowStage, DepthStage))
-    check = CalibrationCheck(OptimizerSettings())
+    check = CalibrationCheck(OptimizerSettings(), camera_of(recording.calibration))
     flows: list[FlowBatch] = []
     depths: list[DepthBatch] = []
     for packet in recording.packets():

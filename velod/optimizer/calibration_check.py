@@ -22,7 +22,8 @@ IMU_CLOCK, IMU_ROTATION = "calibration.imu_clock", "calibration.imu_rotation"
 class CalibrationCheck:
     """``gauges`` and ``alarms`` are kept up to date; a value that the motion does not show is missing."""
 
-    def __init__(self, settings: OptimizerSettings) -> None:
+    def __init__(self, settings: OptimizerSettings, camera: tuple[float, float, float]) -> None:
+        """``camera``: f, cx, cy of the rectified left image, px."""
         self.gauges: dict[str, float] = {}
         self.alarms: dict[str, str] = {}
         self._limits = {
@@ -32,7 +33,7 @@ class CalibrationCheck:
             IMU_CLOCK: settings.alarm_imu_clock_ms,
             IMU_ROTATION: settings.alarm_imu_rotation_deg,
         }
-        self._stereo, self._scale = StereoCheck(), ScaleCheck()
+        self._stereo, self._scale = StereoCheck(camera), ScaleCheck()
         self._offsets: Offsets | None = None
         self._turn = 0
 

@@ -16,6 +16,7 @@ import numpy as np
 from velod.config import Settings
 from velod.events.sensor_size import for_sensor
 from velod.geometry.calibration import Calibration
+from velod.geometry.rectify import rectify
 from velod.optimizer.attitude import Attitude
 from velod.optimizer.calibration_check import CalibrationCheck
 from velod.optimizer.dead_reckoning import DeadReckoning
@@ -57,7 +58,8 @@ class OptimizerStage:
         ingest = for_sensor(settings, calibration.left.width, calibration.left.height).ingest
         self._silence_ns = None if ingest.batch == "count" else round(ingest.period_ms * 1e6)
         self.counters: dict[str, int] = {}
-        self._check = CalibrationCheck(settings.optimizer)
+        rect = rectify(calibration)
+        self._check = CalibrationCheck(settings.optimizer, (rect.f, rect.cx, rect.cy))
         self.alarms, self.gauges = self._check.alarms, self._check.gauges
         self._seq = 0
         self._reckoning = DeadReckoning(settings.optimizer.window_s, settings.imu.gyro_noise)
