@@ -34,8 +34,8 @@ VALID_SIGMA, VALID_SHARE = 0.1, 0.01
 """A velocity becomes valid when its largest sigma is below VALID_SIGMA m/s + VALID_SHARE of its speed ..."""
 EARLY_NS, EARLY_FACTOR = 70_000_000, 0.5
 """... times EARLY_FACTOR while less than EARLY_NS have been seen, when gravity is hardly known ..."""
-LATE_NS, LATE_FACTOR = 300_000_000, 2.0
-"""... and times LATE_FACTOR from LATE_NS on: a velocity that says how uncertain it is, is worth more than none ..."""
+LATE_NS, LATE_SIGMA = 300_000_000, 0.2
+"""... or below LATE_SIGMA m/s from LATE_NS on: a velocity that tells its uncertainty is worth more than none ..."""
 LOST_FACTOR = 4.0
 """... and stays valid until it is this many times larger."""
 DEGRADED_AFTER_NS = 100_000_000
@@ -338,8 +338,7 @@ class OptimizerStage:
             seen_ns = tau - self._estimator.first_usable_t_ns
             # nothing may speak against IMU or calibration: what is uncertain for that is wrong
             late = seen_ns >= LATE_NS and not self._was_lost and self._estimator.biases_as_specified
-            factor = EARLY_FACTOR if seen_ns < EARLY_NS else LATE_FACTOR if late else 1.0
-            if sigma > limit * factor:
+            if sigma > (EARLY_FACTOR * limit if seen_ns < EARLY_NS else max(limit, LATE_SIGMA) if late else limit):
                 return state, self._uncertain(tau, sigma), False
             self._was_valid, self._was_lost = True, False
         if sigma > LOST_FACTOR * limit:
