@@ -78,6 +78,14 @@ def test_ingest_is_waited_for_a_moment_and_its_last_word_on_the_events_stands() 
     assert values([samples]) == [1.0]
 
 
+def test_the_end_of_a_recording_is_no_bridge() -> None:
+    b = bridge()
+    b.keep(encode(packet(0), 0))
+    b.from_ingest(from_ingest(0), 0.0)
+    assert b.due(100.0) == []
+    assert not b.counters
+
+
 def test_what_ingest_says_of_events_alone_does_not_hide_that_its_samples_are_missing() -> None:
     b = bridge()
     b.from_ingest(from_ingest(0), 0.0)

@@ -40,6 +40,7 @@ class ImuBridge:
         self._heard_s = 0.0  # when there were samples of ingest
         self._t_ns = -1  # newest sample handed over
         self._stream: ImuStream | None = None  # while bridging
+        self._counted = False  # the bridge over this silence
 
     def keep(self, packet: bytes) -> None:
         """A packet of the sensor as it came; it is looked at when it is needed."""
@@ -71,7 +72,7 @@ class ImuBridge:
     def _begin(self) -> None:
         if self._stream is None:
             self._stream = ImuStream(self._settings, self._time_offset_s, Counter(), {})
-            self.counters["imu.bridges"] += 1
+            self._counted = False
 
     def _from_sensor(self, before_ns: int | None = None) -> list[ImuSamples]:
         """New samples of the packets kept, as if ingest had sent them without any word of events."""
@@ -83,7 +84,10 @@ class ImuBridge:
                 samples = replace(self._last, sample_t_ns=t_ns[:n], accel=accel[:n], gyro=gyro[:n])
                 bridged.append(self._new(replace(samples, t_ns=_end(t_ns[:n], self._last.t_ns))))
         bridged = [samples for samples in bridged if len(samples.sample_t_ns)]
-        self.counters["imu.bridged"] += sum(len(samples.sample_t_ns) for samples in bridged)
+        if bridged:
+            self.counters["imu.bridges"] += not self._counted
+            self.counters["imu.bridged"] += sum(len(samples.sample_t_ns) for samples in bridged)
+            self._counted = True
         return bridged
 
     def _checked(self, data: bytes) -> list[tuple[I64, F64, F64]]:
