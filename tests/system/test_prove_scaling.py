@@ -11,6 +11,7 @@ from velod.prove.scaling import scaling
 pytestmark = pytest.mark.system
 
 
+@pytest.mark.long
 def test_two_workers_do_what_one_cannot(slanted: Path) -> None:
     """30 ms for each of 50 batches a second: one does two thirds of them, and ingest makes no more than that."""
     one, two = scaling(slanted, [1, 2], load_ms=30.0, speed=1.0, say=str)

@@ -100,6 +100,7 @@ def test_losses_are_told_from_counts_of_work() -> None:
         "batches": 4,
         "points.refined": 7,
         "flow.rms": 3,
+        "bridge.begun": 1,
         "wire.truncated": 0,
         "gap.events": 1,
         "packets.gap": 2,

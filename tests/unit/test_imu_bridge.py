@@ -64,7 +64,7 @@ def test_every_sample_is_handed_over_once_and_in_order_whatever_ingest_does(seed
     assert values(handed) == [float(i) for i in range(400)]
     t_ns = np.concatenate([samples.sample_t_ns for samples in handed])
     assert np.array_equal(t_ns, START_NS - round(OFFSET_S * 1e9) + STEP_NS * np.arange(400))
-    assert b.counters["imu.bridges"] > 0
+    assert b.counters["bridge.begun"] > 0
 
 
 def test_ingest_is_waited_for_a_moment_and_its_last_word_on_the_events_stands() -> None:

@@ -85,8 +85,8 @@ class ImuBridge:
                 bridged.append(self._new(replace(samples, t_ns=_end(t_ns[:n], self._last.t_ns))))
         bridged = [samples for samples in bridged if len(samples.sample_t_ns)]
         if bridged:
-            self.counters["imu.bridges"] += not self._counted
-            self.counters["imu.bridged"] += sum(len(samples.sample_t_ns) for samples in bridged)
+            self.counters["bridge.begun"] += not self._counted
+            self.counters["bridge.samples"] += sum(len(samples.sample_t_ns) for samples in bridged)
             self._counted = True
         return bridged
 
