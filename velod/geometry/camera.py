@@ -17,6 +17,8 @@ _MAX_ITERATIONS = 30
 # Where the lens squeezes the radius by more than this the model is about to fold over, and means nothing.
 _MIN_STRETCH = 0.05
 
+Row = tuple[float, float, float]
+
 
 def A_v(x: F64, y: F64, f: float) -> F64:
     """A of Eq. 1, (..., 2, 3), px: flow = A_v v / Z + B_w w. x, y (...): px from the principal point; f: px."""
@@ -63,17 +65,20 @@ def motion_field_rows(x: F64, y: F64, f: float, cx: float, cy: float, n: F64) ->
 
 
 @njit(cache=True, nogil=True)
+def motion_field_row(u: float, v: float, f: float, nx: float, ny: float) -> tuple[Row, Row]:
+    """``motion_field_rows`` for kernels: one row of each, at (u, v) px from the principal point."""
+    # Eq. 4: n^T A_v and n^T B_w of Eq. 1
+    nA = -f * nx, -f * ny, nx * u + ny * v
+    nB = nx * u * v / f + ny * (f + v * v / f), -nx * (f + u * u / f) - ny * u * v / f, nx * v - ny * u
+    return nA, nB
+
+
+@njit(cache=True, nogil=True)
 def _motion_field_rows(x: F64, y: F64, f: float, cx: float, cy: float, n: F64, nA: F64, nB: F64) -> None:
     for i in range(x.shape[0]):
-        u, v = x[i] - cx, y[i] - cy
-        nx, ny = n[i, 0], n[i, 1]
-        # Eq. 4: n^T A_v and n^T B_w of Eq. 1
-        nA[i, 0] = -f * nx
-        nA[i, 1] = -f * ny
-        nA[i, 2] = nx * u + ny * v
-        nB[i, 0] = nx * u * v / f + ny * (f + v * v / f)
-        nB[i, 1] = -nx * (f + u * u / f) - ny * u * v / f
-        nB[i, 2] = nx * v - ny * u
+        a, b = motion_field_row(x[i] - cx, y[i] - cy, f, n[i, 0], n[i, 1])
+        nA[i, 0], nA[i, 1], nA[i, 2] = a
+        nB[i, 0], nB[i, 1], nB[i, 2] = b
 
 
 def distort(p: F64, camera: Camera) -> tuple[F64, F64]:

@@ -17,6 +17,7 @@ import numpy as np
 from numba import njit
 
 from velod.events.columns import readonly
+from velod.geometry.camera import motion_field_row
 from velod.optimizer.small import median
 from velod.types import F32, F64, I64, U16
 
@@ -229,10 +230,7 @@ def row_in_body(
     u: float, v: float, f: float, nx: float, ny: float, rho: float, R_CB: F64, p: F64, k: int, a: F64, b: F64
 ) -> None:
     """Row k of a and b: n^T A rho R_CB and n^T B R_CB + p x a, at (u, v) px from the principal point (Eq. 4)."""
-    a0, a1, a2 = -f * nx, -f * ny, nx * u + ny * v
-    b0 = nx * u * v / f + ny * (f + v * v / f)
-    b1 = -nx * (f + u * u / f) - ny * u * v / f
-    b2 = nx * v - ny * u
+    (a0, a1, a2), (b0, b1, b2) = motion_field_row(u, v, f, nx, ny)
     for i in range(3):
         a[k, i] = rho * (a0 * R_CB[0, i] + a1 * R_CB[1, i] + a2 * R_CB[2, i])
         b[k, i] = b0 * R_CB[0, i] + b1 * R_CB[1, i] + b2 * R_CB[2, i]
