@@ -86,8 +86,8 @@ class Estimator:
         o = settings.optimizer
         rect = rectify(calibration)
         self._o, self._imu = o, settings.imu
-        self._f = rect.f
-        self._maker = EquationMaker((rect.f, rect.cx, rect.cy), rect.R_CB, rect.p_BC_B)
+        self.camera = (rect.f, rect.cx, rect.cy)
+        self._maker = EquationMaker(self.camera, rect.R_CB, rect.p_BC_B)
         self._knot_ns = int(o.knot_s * NS_PER_S)
         self._interval_ns = int(o.preintegration_s * NS_PER_S)
         self.counters: dict[str, int] = {}
@@ -422,7 +422,7 @@ class Estimator:
         self._note_usable(t_ns)
 
     def _still_sigma(self) -> float:
-        return self._standstill.sigma(self._depth_m / self._f)
+        return self._standstill.sigma(self._depth_m / self.camera[0])
 
     def _innovation(self, t_ns: int, rows: Rows, fit: Fit, predicted: tuple[F64, F64], weak_L: F64) -> float:
         """Squared Mahalanobis distance of the batch's own velocity from the predicted one, as of three dimensions.

@@ -16,7 +16,6 @@ import numpy as np
 from velod.config import Settings
 from velod.events.sensor_size import for_sensor
 from velod.geometry.calibration import Calibration
-from velod.geometry.rectify import rectify
 from velod.optimizer.attitude import Attitude
 from velod.optimizer.calibration_check import CalibrationCheck
 from velod.optimizer.dead_reckoning import DeadReckoning
@@ -58,9 +57,6 @@ class OptimizerStage:
         ingest = for_sensor(settings, calibration.left.width, calibration.left.height).ingest
         self._silence_ns = None if ingest.batch == "count" else round(ingest.period_ms * 1e6)
         self.counters: dict[str, int] = {}
-        rect = rectify(calibration)
-        self._check = CalibrationCheck(settings.optimizer, (rect.f, rect.cx, rect.cy))
-        self.alarms, self.gauges = self._check.alarms, self._check.gauges
         self._seq = 0
         self._reckoning = DeadReckoning(settings.optimizer.window_s, settings.imu.gyro_noise)
         self._pending: dict[int, Parts] = {}  # by the number of the batch
@@ -69,6 +65,8 @@ class OptimizerStage:
         self._next_seq = -1  # first batch not yet taken in nor given up; -1: nothing heard from ingest yet
         self._closed_seq = -1  # newest batch that ingest has closed
         self._reset()
+        self._check = CalibrationCheck(settings.optimizer, self._estimator.camera)
+        self.alarms, self.gauges = self._check.alarms, self._check.gauges
 
     def _reset(self) -> None:
         self._estimator = Estimator(self._settings, self._calibration)
