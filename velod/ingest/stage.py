@@ -62,7 +62,8 @@ class IngestStage:
         self._imu = ImuStream(s, cal.time_offset_s, self.counters, self.alarms)
         self._taken = new_surface(cal.left.height, cal.left.width)
         self._open = OpenBatch(s)
-        self._time_noise = TimeNoise(self._settings.flow)
+        # The paper's rules know nothing of it.
+        self._time_noise = TimeNoise(self._settings.flow) if s.selection == "burst" else None
         self._batch_t_ns = 0
         if self._slices is not None:
             # Parts of a batch that will never be whole must not join another one.
@@ -197,12 +198,13 @@ class IngestStage:
                     seq, t_end_ns, t_start_ns, n_events, x, y, age, p, patch, seq, ring=ring, time_noise_ns=noise_ns
                 )
             ]
-            self._time_noise.learn(patch)
         else:
-            self._time_noise.learn(self._slices.patches(t_end_ns))
+            patch = self._slices.patches(t_end_ns)
             x, y, age, p = self._slices.selected(t_end_ns)
             event_batches = self._slices.rest_of(self._open, seq, t_end_ns)
             t_start_ns = self._slices.begin_batch()
+        if self._time_noise is not None:
+            self._time_noise.learn(patch)
         unit_ns = age_unit_ns(memory_ns)
         return [
             StereoBatch(
@@ -238,8 +240,8 @@ class IngestStage:
 
     @property
     def _noise_ns(self) -> int:
-        """What is known of the time stamps' errors; the paper's rules know nothing of them."""
-        return self._time_noise.sigma_ns if self._settings.ingest.selection == "burst" else 0
+        """What is known of the time stamps' errors."""
+        return 0 if self._time_noise is None else self._time_noise.sigma_ns
 
     def _no_samples(self, t_end_ns: int) -> ImuSamples:
         """Tells the optimizer how far the events have come without waiting for the IMU."""
