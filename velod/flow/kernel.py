@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 
 from velod.events.plane_fit import INNER_AT, RING_AT, SIZE, WIDE_SIZE, fit_plane, honest_rms, rms_px, widen_plane
+from velod.geometry.cholesky import backward, factorise, forward
 from velod.types import F32, F64, I64, RING, U16, U32
 
 REFUSALS = ("unfit", "rms", "speed", "unrectified")
@@ -136,7 +137,9 @@ def _let_in_motion_along_edges(flow: F32, turn: F64) -> None:
             u[j] += row[j] * flow[i, 4]
             for k in range(j + 1):
                 H[j, k] += row[j] * row[k]
-    _solve_in_place(H, u)
+    factorise(H)
+    forward(H, u)
+    backward(H, u)
     left2 = 6.0 * np.mean(flow[:, 4].astype(np.float64) ** 2) / m
     for i in range(m):
         ux, uy = u[0] + u[2] * x[i] + u[4] * y[i], u[1] + u[3] * x[i] + u[5] * y[i]
@@ -145,25 +148,6 @@ def _let_in_motion_along_edges(flow: F32, turn: F64) -> None:
         ux, uy = u[0] + u[2] * x[i] + u[4] * y[i], u[1] + u[3] * x[i] + u[5] * y[i]
         along_edge2 = (flow[i, 2] * uy - flow[i, 3] * ux) ** 2 + left2
         flow[i, 5] = math.sqrt(np.float64(flow[i, 5]) ** 2 + along_edge2 * turn[i] ** 2)
-
-
-@njit(cache=True, nogil=True)
-def _solve_in_place(H: F64, x: F64) -> None:
-    """x becomes H^-1 x, H its own Cholesky factor; H is positive definite, given by its lower triangle."""
-    n = len(x)
-    for i in range(n):
-        for j in range(i + 1):
-            s = H[i, j]
-            for k in range(j):
-                s -= H[i, k] * H[j, k]
-            H[i, j] = math.sqrt(s) if i == j else s / H[j, j]
-        for k in range(i):
-            x[i] -= H[i, k] * x[k]
-        x[i] /= H[i, i]
-    for i in range(n - 1, -1, -1):
-        for k in range(i + 1, n):
-            x[i] -= H[k, i] * x[k]
-        x[i] /= H[i, i]
 
 
 @njit(cache=True, nogil=True, inline="always")

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import math
-
-import numpy as np
 from numba import njit
 
+from velod.geometry.cholesky import factorise, forward
 from velod.types import F64
 
 
@@ -69,18 +67,10 @@ def median(values: F64) -> float:
 @njit(cache=True, nogil=True)
 def squared_distance(d: F64, S: F64) -> float:
     """d^T S^-1 d for d (n,) and symmetric, positive definite S (n, n), by Cholesky's factor."""
-    n = d.size
-    root, y, total = np.empty((n, n)), np.empty(n), 0.0
-    for i in range(n):
-        for j in range(i + 1):
-            r = S[i, j]
-            for k in range(j):
-                r -= root[i, k] * root[j, k]
-            root[i, j] = math.sqrt(r) if i == j else r / root[j, j]
-        y[i] = d[i]
-        for k in range(i):
-            y[i] -= root[i, k] * y[k]
-        y[i] /= root[i, i]
+    root, y, total = S.copy(), d.copy(), 0.0
+    factorise(root)
+    forward(root, y)
+    for i in range(y.size):
         total += y[i] * y[i]
     return total
 
