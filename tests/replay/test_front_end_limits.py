@@ -61,6 +61,14 @@ def judged(recording: Recording, settings: Settings, also: Callable[[Message], N
     return Judged(recording, true_depth, kept.selected, kept.flows, kept.depths)
 
 
+def assert_within(flow: FlowErrors, n: int, bias: float, spread: float, outliers: float) -> None:
+    """More than ``n`` flows; the others are limits, as shares."""
+    assert flow.n > n
+    assert abs(flow.bias) < bias
+    assert flow.spread < spread
+    assert flow.outliers < outliers
+
+
 @pytest.fixture
 def record(tmp_path_factory: pytest.TempPathFactory) -> Record:
     """Simulate a recipe for so many seconds."""
@@ -78,10 +86,7 @@ def test_a_low_contrast_threshold_spoils_no_flow(record: Record) -> None:
     recipe = sequence("boxes-4")
     recipe = replace(recipe, events=replace(recipe.events, threshold=0.15))
     flow = judged(record(recipe, 0.12), Settings()).flow
-    assert flow.n > 2000
-    assert abs(flow.bias) < 0.005
-    assert flow.spread < 0.03
-    assert flow.outliers < 0.005
+    assert_within(flow, n=2000, bias=0.005, spread=0.03, outliers=0.005)
 
 
 def test_mismatch_jitter_and_noise_together_leave_the_flow_within_five_percent(record: Record) -> None:
@@ -90,10 +95,7 @@ def test_mismatch_jitter_and_noise_together_leave_the_flow_within_five_percent(r
     effects = replace(recipe.effects, jitter_us=500.0, noise_hz=5.0)
     recipe = replace(recipe, effects=effects, events=replace(recipe.events, threshold_sigma=0.05))
     flow = judged(record(recipe, 0.35), Settings()).flow
-    assert flow.n > 2500
-    assert abs(flow.bias) < 0.01
-    assert flow.spread < 0.05
-    assert flow.outliers < 0.015
+    assert_within(flow, n=2500, bias=0.01, spread=0.05, outliers=0.015)
 
 
 def test_half_a_millisecond_of_jitter_leaves_the_velocity_of_a_spin(record: Record) -> None:
