@@ -425,7 +425,7 @@ def test_counting_the_spline_from_another_origin_moves_it_and_nothing_else():
     F = w.selector(t)
     x = w.solve([], None, 0.0)
     before, P = F @ x.x, x.cov(F)
-    w.shift(np.array([300.0, -20.0, 5.0]))
+    w.shift(np.array([300.0, -20.0, 5.0]), np.zeros(3))
     y = w.solve([], None, 0.0)
     assert np.allclose((F @ y.x)[:3] - before[:3], [300.0, -20.0, 5.0], atol=1e-6)
     assert np.allclose((F @ y.x)[3:], before[3:], atol=1e-5)

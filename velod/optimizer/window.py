@@ -41,9 +41,6 @@ COMMON_S = np.array([3.0, 100.0, 100.0])
 """How long common errors last, s: the flow's scale changes with the scene, delay and depth's scale are the rig's."""
 
 
-NO_COMMON = np.zeros(3)
-
-
 class Solution:
     """States of the window at their optimum; valid until the window's next solve, whose workspace it uses."""
 
@@ -213,7 +210,7 @@ class Window:
         else:
             self._front = -1
 
-    def shift(self, offset: F64, common: F64 = NO_COMMON) -> None:
+    def shift(self, offset: F64, common: F64) -> None:
         """Count states from another origin: every control point + offset (3,), every common error + ``common`` (3,).
 
         The information is the same.
