@@ -32,6 +32,9 @@ def test_exp_and_the_kernel_equal_scipy_at_any_angle(length: float) -> None:
 def test_log_undoes_exp_below_half_a_turn(w: np.ndarray) -> None:
     w = w if np.linalg.norm(w) < 3.1 else w / 2.0
     np.testing.assert_allclose(so3.log(so3.exp(w)), w, atol=1e-10)
+    out = np.empty(3)
+    so3.log_so3(so3.exp(w), out)
+    np.testing.assert_allclose(out, w, atol=1e-8)
 
 
 @given(vectors)

@@ -131,6 +131,23 @@ def exp_so3(w: F64, out: F64) -> None:
 
 
 @njit(cache=True, nogil=True)
+def vee_so3(R: F64, out: F64) -> None:
+    """The vector of R's skew part: its axis times the sine of its angle, into out (3,)."""
+    out[0] = (R[2, 1] - R[1, 2]) / 2.0
+    out[1] = (R[0, 2] - R[2, 0]) / 2.0
+    out[2] = (R[1, 0] - R[0, 1]) / 2.0
+
+
+@njit(cache=True, nogil=True)
+def log_so3(R: F64, out: F64) -> None:
+    """``log`` for kernels: the rotation vector, rad, of R (3, 3) by less than half a turn, into out (3,)."""
+    vee_so3(R, out)
+    sine = math.sqrt(out[0] ** 2 + out[1] ** 2 + out[2] ** 2)
+    if sine > 1e-9:
+        out *= math.atan2(sine, (R[0, 0] + R[1, 1] + R[2, 2] - 1.0) / 2.0) / sine
+
+
+@njit(cache=True, nogil=True)
 def quaternion_so3(R: F64, q: F64) -> None:
     """``quaternion_from_matrix`` for kernels: the unit quaternion, xyzw, w >= 0, of R (3, 3) into q (4,)."""
     best, largest = 0, -1.0

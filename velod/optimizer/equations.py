@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 
 from velod.events.columns import readonly
+from velod.geometry.so3 import vee_so3
 from velod.optimizer.flow_equation import Measured, Rows, match, row_in_body
 from velod.optimizer.inertial import InertialMemory
 from velod.optimizer.small import median, multiply
@@ -174,9 +175,9 @@ def _motion(t_ns: I64, R_LB: F64, s_L: F64, known_ns: int, e_L: F64, g_L: F64, o
     dt = (t_ns[1] - t_ns[0]) * 1e-9
     turn, first, second = np.empty((3, 3)), np.empty(3), np.empty(3)
     multiply(R_LB[0].T, R_LB[1], turn)
-    _small_turn(turn, first)
+    vee_so3(turn, first)  # of so small a turn the rotation vector, to the third order
     multiply(R_LB[1].T, R_LB[2], turn)
-    _small_turn(turn, second)
+    vee_so3(turn, second)
     for i in range(3):
         out[0, i] = (first[i] + second[i]) / (2.0 * dt)
         out[2, i] = (second[i] - first[i]) / dt**2
@@ -185,14 +186,6 @@ def _motion(t_ns: I64, R_LB: F64, s_L: F64, known_ns: int, e_L: F64, g_L: F64, o
             for k, sign in ((0, -1.0), (2, 1.0)):
                 v_L = s_L[k, r] + e_L[r] - (t_ns[k] - known_ns) * 1e-9 * g_L[r]
                 out[1, i] += sign * R_LB[k, r, i] * v_L / (2.0 * dt)
-
-
-@njit(cache=True, nogil=True)
-def _small_turn(R: F64, out: F64) -> None:
-    """Rotation vector (3,) of a small rotation (3, 3), to the third order."""
-    out[0] = (R[2, 1] - R[1, 2]) / 2.0
-    out[1] = (R[0, 2] - R[2, 0]) / 2.0
-    out[2] = (R[1, 0] - R[0, 1]) / 2.0
 
 
 @njit(cache=True, nogil=True)

@@ -21,6 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
+from velod.geometry.so3 import log_so3
 from velod.optimizer.flow_equation import BIN_NS, Bins
 from velod.optimizer.inertial import InertialMemory
 from velod.optimizer.small import invert3, multiply
@@ -175,21 +176,18 @@ def _rates(t_ns: int, memory: InertialMemory) -> tuple[F64, F64]:
     """Angular velocity and acceleration (3,) at ``t_ns``, from before and after."""
     R_LB, _, _ = memory.at(t_ns + np.array([-FAR_NS, -NEAR_NS, NEAR_NS, FAR_NS]))
     turns, seconds = np.empty((2, 3)), (FAR_NS - NEAR_NS) * 1e-9
-    _turn(R_LB[0], R_LB[1], turns[0])
-    _turn(R_LB[2], R_LB[3], turns[1])
+    _turns(R_LB, turns)
     before, after = turns / seconds
     return (before + after) / 2.0, (after - before) / ((FAR_NS + NEAR_NS) * 1e-9)
 
 
 @njit(cache=True, nogil=True)
-def _turn(R_LA: F64, R_LB: F64, out: F64) -> None:
-    """Rotation vector (3,), rad, of R_AB, by less than half a turn."""
+def _turns(R_LB: F64, out: F64) -> None:
+    """Rotation vectors, rad, from each even attitude of R_LB (2 m, 3, 3) to the odd one after it, out (m, 3)."""
     R = np.empty((3, 3))
-    multiply(R_LA.T, R_LB, R)
-    out[0], out[1], out[2] = (R[2, 1] - R[1, 2]) / 2.0, (R[0, 2] - R[2, 0]) / 2.0, (R[1, 0] - R[0, 1]) / 2.0
-    sine = math.sqrt(out[0] ** 2 + out[1] ** 2 + out[2] ** 2)
-    if sine > 1e-9:
-        out *= math.atan2(sine, (R[0, 0] + R[1, 1] + R[2, 2] - 1.0) / 2.0) / sine
+    for k in range(len(out)):
+        multiply(R_LB[2 * k].T, R_LB[2 * k + 1], R)
+        log_so3(R, out[k])
 
 
 @njit(cache=True, nogil=True)
