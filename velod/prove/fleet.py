@@ -105,11 +105,12 @@ def _tls(stack: ExitStack) -> _Way:
 
 def _measure(listener: Listener, rigs: int, hz: float, seconds: float, router: int, groups: list[int]) -> Fleet:
     _receive(listener, _WARM_UP_S)
-    lost, overflowed = _losses(listener)
+    lost_before, overflowed_before = _losses(listener)
     before = [sum(map(cpu_s, pids)) for pids in ([router], groups, [os.getpid()])]
     start_s = time.monotonic()
     latency_ms, heard = _receive(listener, seconds)
     elapsed_s = time.monotonic() - start_s
+    lost, overflowed = _losses(listener)
     after = [sum(map(cpu_s, pids)) for pids in ([router], groups, [os.getpid()])]
     of_router, of_rigs, of_consumer = ((b - a) / elapsed_s for a, b in zip(before, after, strict=True))
     p50, p99 = np.percentile(latency_ms, (50, 99)) if latency_ms else (np.nan, np.nan)
@@ -119,8 +120,8 @@ def _measure(listener: Listener, rigs: int, hz: float, seconds: float, router: i
         seconds=elapsed_s,
         rate_hz=len(latency_ms) / elapsed_s,
         silent=rigs - len(heard),
-        lost=_losses(listener)[0] - lost,
-        overflowed=_losses(listener)[1] - overflowed,
+        lost=lost - lost_before,
+        overflowed=overflowed - overflowed_before,
         latency_p50_ms=float(p50),
         latency_p99_ms=float(p99),
         router_cores=of_router,
