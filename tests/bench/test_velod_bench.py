@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from velod.cli_bench import bench
+from velod.cli.bench import bench
 from velod.eval import bench_input
 from velod.eval.bench import Case, Result, Size, measure
 from velod.eval.bench_cases import GROUPS, cases

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from velod.cli_stages import true_depth_of
+from velod.cli.stages import true_depth_of
 from velod.config import Settings
 from velod.eval.front_end import FrontEnd
 from velod.eval.metrics import Metrics, evaluate

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from velod.cli import main
-from velod.cli_compare import floor_mps
+from velod.cli.compare import floor_mps
 from velod.config import Settings
 from velod.eval.compare import METHODS
 from velod.io import open_recording
@@ -106,10 +106,10 @@ def test_the_table_simulates_its_sequences_and_draws_the_imus_noise_anew_for_eac
     cache = simulated("boxes-4", 0.6).parent.parent
     monkeypatch.setenv("VELOD_CACHE_DIR", str(cache))
     monkeypatch.setattr("velod.sim.TABLE_I", {"boxes-4": (2.77, 2.05)})
-    monkeypatch.setattr("velod.cli_compare._SECONDS", {"boxes": 0.6})
-    monkeypatch.setattr("velod.cli_compare._IMU_SECONDS", {"boxes": 2.0})
-    monkeypatch.setattr("velod.cli_compare._IMU_NOISES", 3)
-    monkeypatch.setattr("velod.cli_compare._SEEDS", (1, 2))
+    monkeypatch.setattr("velod.cli.compare._SECONDS", {"boxes": 0.6})
+    monkeypatch.setattr("velod.cli.compare._IMU_SECONDS", {"boxes": 2.0})
+    monkeypatch.setattr("velod.cli.compare._IMU_NOISES", 3)
+    monkeypatch.setattr("velod.cli.compare._SEEDS", (1, 2))
     assert main(["eval", "--table", "synthetic", "--json", "-"]) == 0
     out, err = capsys.readouterr()
     tree = json.loads(out)

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from velod.cli import main
-from velod.cli_stages import true_depth_of
+from velod.cli.stages import true_depth_of
 from velod.config import from_tree
 from velod.eval.front_end import FrontEnd
 from velod.eval.metrics import evaluate

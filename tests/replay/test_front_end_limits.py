@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from velod.cli_stages import true_depth_of
+from velod.cli.stages import true_depth_of
 from velod.config import Settings, from_tree
 from velod.depth.stage import DepthStage
 from velod.eval.front_end import FrontEnd

@@ -9,9 +9,9 @@ import time
 import numpy as np
 import pytest
 
-from velod.cli_play import Played, shortcomings
-from velod.cli_report import Line, describe_velocity, progress_bar, speed_and_sigma
-from velod.cli_watch import Place, describe, losses, table
+from velod.cli.play import Played, shortcomings
+from velod.cli.report import Line, describe_velocity, progress_bar, speed_and_sigma
+from velod.cli.watch import Place, describe, losses, table
 from velod.client import Received
 from velod.config import ZenohSettings
 from velod.eval.metrics import Metrics

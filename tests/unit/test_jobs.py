@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from velod.cli_cases import SequenceJob
-from velod.cli_exit import RunFailed
-from velod.cli_jobs import code_fingerprint, commit, run_jobs
+from velod.cli.cases import SequenceJob
+from velod.cli.exit import RunFailed
+from velod.cli.jobs import code_fingerprint, commit, run_jobs
 from velod.config import Settings
 
 

@@ -15,8 +15,8 @@ import pytest
 from mcap.reader import make_reader
 
 from tests import slanted_scene
-from velod import cli_record
-from velod.cli_watch import Place
+from velod.cli import record
+from velod.cli.watch import Place
 from velod.client import Received
 from velod.config import ZenohSettings
 from velod.io import RecordingError, open_recording
@@ -161,10 +161,10 @@ class Queue:
 def test_what_waits_in_the_queue_when_recording_ends_is_recorded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cli_record, "Listener", lambda *_: Queue(waiting=5))
+    monkeypatch.setattr(record, "Listener", lambda *_: Queue(waiting=5))
     stop = Event()
     stop.set()
-    session = cli_record.Session(Place("r", ZenohSettings()), (VELOCITY,), None, stop)
+    session = record.Session(Place("r", ZenohSettings()), (VELOCITY,), None, stop)
     taken: list[Received] = []
     session.run(tmp_path / "run.mcap", taken.append)
     assert len(taken) == session.n == 5

@@ -6,7 +6,7 @@ import argparse
 
 import pytest
 
-from velod.cli_sim import add_options, recipe_of
+from velod.cli.sim import add_options, recipe_of
 from velod.config import ConfigError, Settings, from_tree
 from velod.events.sensor_size import for_sensor
 

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 import zenoh
 
-from velod import cli_watch
-from velod.cli_exit import EXIT_FAILED
-from velod.cli_watch import Way
+from velod.cli import watch
+from velod.cli.exit import EXIT_FAILED
+from velod.cli.watch import Way
 from velod.config import Settings, ZenohSettings
 from velod.runtime.outlet import Outlet
 from velod.runtime.roles import SHELLS
@@ -220,12 +220,12 @@ def test_a_query_resets_the_odometry_of_every_optimizer_that_hears_it(
             self.resets += 1
 
     stage = Reckoner(lambda message: [])
-    monkeypatch.setattr(cli_watch, "open_session", lambda settings: nullcontext(session))
+    monkeypatch.setattr(watch, "open_session", lambda settings: nullcontext(session))
     with Bench(session, "optimizer", stage):
-        assert cli_watch.reset_odometry(None, Way()) == 0
+        assert watch.reset_odometry(None, Way()) == 0
         deadline_s = time.monotonic() + 5.0
         while not stage.resets and time.monotonic() < deadline_s:
             time.sleep(0.01)
     assert stage.resets == 1
     assert "reset by optimizer-0" in capsys.readouterr().out
-    assert cli_watch.reset_odometry(None, Way()) == EXIT_FAILED
+    assert watch.reset_odometry(None, Way()) == EXIT_FAILED

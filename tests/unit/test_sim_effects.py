@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from velod.cli import main
-from velod.cli_stages import true_depth_of
+from velod.cli.stages import true_depth_of
 from velod.geometry.camera import distort, normalised, pixels
 from velod.io import EventColumns, open_recording
 from velod.sim import sequence, simulate

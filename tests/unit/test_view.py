@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from tests import synthetic
-from velod.cli_view import Scene, keep_to_ourselves
+from velod.cli.view import Scene, keep_to_ourselves
 from velod.config import Settings
 from velod.optimizer.stage import OptimizerStage
 from velod.types import DepthBatch, EventBatch, FlowBatch, ImuSamples, Velocity

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from velod.cli_exit import EXIT_FAILED
-from velod.cli_watch import Way, place_of
+from velod.cli.exit import EXIT_FAILED
+from velod.cli.watch import Way, place_of
 from velod.client import Listener
 from velod.optimizer.flow_equation import pairs
 from velod.optimizer.parts import Parts, batch_seq

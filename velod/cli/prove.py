@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any, TextIO
 
-from velod.cli_exit import RunFailed
+from velod.cli.exit import RunFailed
 
 
 def add_actions(actions: Any) -> None:
@@ -52,7 +52,7 @@ def _out(args: argparse.Namespace) -> TextIO:
 
 def _end(args: argparse.Namespace, result: Any, failures: Sequence[str]) -> int:
     """Write the JSON. Raises RunFailed where something is not as claimed."""
-    from velod.cli_report import write_json
+    from velod.cli.report import write_json
 
     if args.json is not None:
         write_json(args.json, result)

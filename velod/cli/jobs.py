@@ -20,9 +20,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import velod
-from velod.cli_cases import Outcome, SequenceJob
-from velod.cli_exit import RunFailed
-from velod.cli_report import Line
+from velod.cli.cases import Outcome, SequenceJob
+from velod.cli.exit import RunFailed
+from velod.cli.report import Line
 
 if TYPE_CHECKING:
     from multiprocessing.synchronize import Event

@@ -7,11 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from velod.cli_config import settings_of
+from velod.cli.config import settings_of
 
 if TYPE_CHECKING:
-    from velod.cli_watch import Way
+    from velod.cli.watch import Way
 
+LOCAL = "tcp/127.0.0.1:17447"
 TOPOLOGIES = ("local", "robot", "fleet", "remote")
 _ROLES = ("driver", "worker", "consumer", "operator")
 
@@ -24,9 +25,9 @@ def add_guard_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_way_options(parser: argparse.ArgumentParser, default: str) -> None:
+def add_way_options(parser: argparse.ArgumentParser) -> None:
     """The way to a running velod."""
-    parser.add_argument("--connect", metavar="ENDPOINT", help=f"where velod runs (default {default})")
+    parser.add_argument("--connect", metavar="ENDPOINT", help=f"where velod runs (default {LOCAL})")
     parser.add_argument("--rig", metavar="NAME", help="name of the rig (default rig0); '*': all rigs")
     parser.add_argument("--role", choices=_ROLES, help="whose certificate to show at a tls/ endpoint")
     add_guard_options(parser)
@@ -34,7 +35,7 @@ def add_way_options(parser: argparse.ArgumentParser, default: str) -> None:
 
 def way_of(args: argparse.Namespace) -> Way:
     """What was said of the way."""
-    from velod.cli_watch import Way
+    from velod.cli.watch import Way
 
     return Way(args.connect, args.rig, args.keys, args.role, args.insecure)
 
@@ -51,7 +52,7 @@ def add_router_options(parser: argparse.ArgumentParser) -> None:
     add_guard_options(parser)
 
 
-def add_relay_options(parser: argparse.ArgumentParser, default: str) -> None:
+def add_relay_options(parser: argparse.ArgumentParser) -> None:
     """From where, to where, how often."""
     parser.add_argument("--to", metavar="ENDPOINT", required=True, help="the other network's router")
     parser.add_argument("--to-keys", metavar="DIR", help="certificates for it, if they are not those of --keys")
@@ -59,7 +60,7 @@ def add_relay_options(parser: argparse.ArgumentParser, default: str) -> None:
         "--to-role", choices=_ROLES, default="worker", help="as whom to publish there (default worker)"
     )
     parser.add_argument("--hz", type=float, default=1.0, help="velocities per second and rig (default 1)")
-    add_way_options(parser, default)
+    add_way_options(parser)
     parser.set_defaults(rig="*")
 
 
@@ -105,7 +106,7 @@ def router(args: argparse.Namespace) -> int:
 
 def relay(args: argparse.Namespace) -> int:
     """Pass velocities on until SIGINT or SIGTERM."""
-    from velod.cli_watch import place_of
+    from velod.cli.watch import place_of
     from velod.config import ZenohSettings
     from velod.relay import relay as run
     from velod.runtime.worker import start_logging, stop_on_signals

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from velod.cli_stages import stages_of, true_depth_of
+from velod.cli.stages import stages_of, true_depth_of
 from velod.config import Settings
 from velod.eval.baselines import benosman_settings, paper_settings
 from velod.eval.compare import Case, compare, without_velocities

@@ -9,10 +9,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
-from velod.cli_config import calibration_of, settings_of
-from velod.cli_exit import RunFailed
-from velod.cli_report import Line, VelocityLine, log_above, progress_bar, with_progress, write_csv, write_json
-from velod.cli_watch import losses
+from velod.cli.config import calibration_of, settings_of
+from velod.cli.exit import RunFailed
+from velod.cli.report import Line, VelocityLine, log_above, progress_bar, with_progress, write_csv, write_json
+from velod.cli.watch import losses
 from velod.config import Settings
 from velod.io import Chunking, Recording, open_recording
 from velod.types import Velocity
@@ -186,7 +186,7 @@ def _metrics(played: Played) -> Metrics | None:
 
 
 def _floor_mps(settings: Settings, played: Played) -> float | None:
-    from velod.cli_compare import floor_mps
+    from velod.cli.compare import floor_mps
 
     return floor_mps(settings, played.recording)
 

@@ -11,10 +11,10 @@ from pathlib import Path
 from threading import Event
 
 from velod import __version__
-from velod.cli_config import calibration_of, settings_of
-from velod.cli_exit import EXIT_FAILED, RunFailed
-from velod.cli_report import Line
-from velod.cli_watch import Place, Way, place_of
+from velod.cli.config import calibration_of, settings_of
+from velod.cli.exit import EXIT_FAILED, RunFailed
+from velod.cli.report import Line
+from velod.cli.watch import Place, Way, place_of
 from velod.client import Listener, Received
 from velod.geometry.calibration import Calibration, CalibrationError, save_calibration
 from velod.io.live import SensorLog

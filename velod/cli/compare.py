@@ -8,12 +8,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from velod import __version__
-from velod.cli_cases import Outcome, SequenceJob, judge_recording
-from velod.cli_config import calibration_of, settings_of
-from velod.cli_exit import RunFailed
-from velod.cli_jobs import commit, run_jobs
-from velod.cli_report import Line, progress_bar, write_json
-from velod.cli_stages import true_depth_of
+from velod.cli.cases import Outcome, SequenceJob, judge_recording
+from velod.cli.config import calibration_of, settings_of
+from velod.cli.exit import RunFailed
+from velod.cli.jobs import commit, run_jobs
+from velod.cli.report import Line, progress_bar, write_json
+from velod.cli.stages import true_depth_of
 from velod.config import Settings
 from velod.eval.floor import with_perfect_flow_and_depth
 from velod.eval.front_end import FrontEnd, estimate

@@ -5,8 +5,8 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from velod.cli_config import calibration_of, settings_of
-from velod.cli_report import with_progress, write_json
+from velod.cli.config import calibration_of, settings_of
+from velod.cli.report import with_progress, write_json
 from velod.config import Settings
 from velod.eval.front_end import FrontEnd
 from velod.eval.scene_truth import DepthImages, SceneTruthError, TrueDepth

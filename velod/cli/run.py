@@ -7,7 +7,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from velod.cli_config import calibration_of, settings_of
+from velod.cli.config import calibration_of, settings_of
 from velod.config import ConfigError, Settings
 
 

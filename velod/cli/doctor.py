@@ -6,10 +6,10 @@ import sys
 from collections.abc import Iterator
 from dataclasses import asdict
 
-from velod.cli_config import settings_of
-from velod.cli_exit import EXIT_FAILED
-from velod.cli_report import write_json
-from velod.cli_watch import Way, place_of
+from velod.cli.config import settings_of
+from velod.cli.exit import EXIT_FAILED
+from velod.cli.report import write_json
+from velod.cli.watch import Way, place_of
 from velod.runtime import checkup
 from velod.runtime.checkup import Finding
 

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from velod.cli_config import settings_of
-from velod.cli_exit import EXIT_FAILED
-from velod.cli_report import describe_attitude, describe_velocity
+from velod.cli.config import settings_of
+from velod.cli.exit import EXIT_FAILED
+from velod.cli.report import describe_attitude, describe_velocity
 from velod.client import Listener, Received
 from velod.config import ZenohSettings
 from velod.runtime.dispatching import SENT

@@ -1,0 +1,5 @@
+import sys
+
+from velod.cli import main
+
+sys.exit(main())

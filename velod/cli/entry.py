@@ -1,0 +1,62 @@
+"""One command: from what was typed to the exit code."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+
+from velod import __version__
+from velod.cli import play_commands, proof_commands, service_commands, watch_commands
+from velod.cli.exit import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE, RunFailed
+from velod.cli.options import plain
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; the exit code. What a user can put right is one line on stderr, never a traceback."""
+    args = _parser().parse_args(argv)
+    command: Callable[[argparse.Namespace], int] = args.command
+    try:
+        return command(args)
+    except KeyboardInterrupt:
+        print("velod: interrupted", file=sys.stderr)
+        return EXIT_INTERRUPTED
+    except BrokenPipeError:
+        # The reader of the pipe (head, less) has seen enough. Python's own flush at exit must not complain again.
+        sys.stdout = None
+        return 0
+    except RunFailed as e:
+        print(f"velod: failed: {_one_line(e)}", file=sys.stderr)
+        return EXIT_FAILED
+    except (ValueError, OSError) as e:
+        # ConfigError, CalibrationError, RecordingError and SessionError are of these kinds.
+        print(f"velod: error: {_one_line(e)}", file=sys.stderr)
+        return EXIT_USAGE
+
+
+def _one_line(e: Exception) -> str:
+    if isinstance(e, OSError) and e.strerror and e.filename is not None:
+        return f"{e.filename}: {e.strerror}"
+    return " ".join(str(e).split()) or type(e).__name__
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = plain(
+        argparse.ArgumentParser,
+        prog="velod",
+        description="Stereo events and an IMU in; metric body-frame velocity with its covariance out.",
+        epilog="""\
+first steps:
+  velod demo                         see it run on simulated sensors, judged against the truth
+  velod replay recording.h5          a recording through the same processes, in real time
+  velod eval recording.h5 --offline  how good it is, where the recording holds the truth
+  velod config init velod.toml       all settings, each with its meaning
+  velod run -c velod.toml            the service beside a sensor driver
+  velod echo                         what it says, from another terminal
+`velod COMMAND --help` has worked examples for each command.""",
+    )
+    parser.add_argument("--version", action="version", version=f"velod {__version__}")
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    for group in (play_commands, service_commands, watch_commands, proof_commands):
+        group.add_commands(commands)
+    return parser
