@@ -1,4 +1,4 @@
-"""What all tests share: hypothesis' settings, and simulated recordings."""
+"""What all tests share: hypothesis' settings, simulated recordings, free ports."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 
+from tests.ports import free_ports
 from velod.sim import simulated_recording
 
 # Every run tries the same examples; a slow machine is not a failure.
@@ -23,6 +24,12 @@ def simulated(pytestconfig: pytest.Config) -> Callable[[str, float], Path]:
             return simulated_recording(name, seconds, seed=1)
 
     return make
+
+
+@pytest.fixture
+def port() -> int:
+    """A port that nobody listens on."""
+    return free_ports(1)[0]
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

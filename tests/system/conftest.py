@@ -1,9 +1,8 @@
-"""Free ports, recordings, and settings for runs with real processes."""
+"""Recordings, and settings for runs with real processes."""
 
 from __future__ import annotations
 
 import math
-import socket
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,14 +12,6 @@ from tests import slanted_scene
 from velod.config import DepthSettings, FlowSettings, Settings, ZenohSettings
 
 BOXES = Path(__file__).parents[3] / "shared" / "data" / "boxes_esim.h5"
-
-
-@pytest.fixture
-def port() -> int:
-    """A port that nobody listens on."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 @pytest.fixture

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import socket
 import subprocess
 import sys
 import time
@@ -15,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.ports import free_ports
 from velod.cli import main
 from velod.client import VelocityClient
 from velod.config import ZenohSettings
@@ -26,12 +26,6 @@ from velod.wire.topics import VELOCITY
 
 pytestmark = pytest.mark.system
 EXAMPLES = Path(__file__).parents[2] / "examples"
-
-
-def free_port() -> int:
-    with socket.socket() as s:
-        s.bind(("127.0.0.1", 0))
-        return int(s.getsockname()[1])
 
 
 def velocity(seq: int, valid: bool = True) -> Velocity:
@@ -64,7 +58,7 @@ def start(stack: ExitStack, port: int) -> Service:
 @pytest.fixture
 def service() -> Iterator[Service]:
     with ExitStack() as stack:
-        yield start(stack, free_port())
+        yield start(stack, free_ports(1)[0])
 
 
 def heard(service: Service) -> None:
@@ -160,7 +154,7 @@ def test_silence_ends_a_receive_with_a_timeout(service: Service) -> None:
 
 
 def test_the_client_may_come_first_and_survives_a_restart_of_the_service() -> None:
-    port = free_port()
+    port = free_ports(1)[0]
     with VelocityClient("rig0", connect=f"tcp/127.0.0.1:{port}", max_age_s=5.0) as client:
         assert client.receive(0.2) is None
         for expected in (7, 8):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import math
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -18,6 +17,7 @@ from threading import Event
 import numpy as np
 import pytest
 
+from tests.ports import free_ports
 from velod.cli import main
 from velod.client import Listener, VelocityClient
 from velod.config import Settings, ZenohSettings
@@ -40,14 +40,6 @@ def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("keys")
     make_keys(folder, rigs=RIGS)
     return folder
-
-
-def free_ports(n: int) -> list[int]:
-    with ExitStack() as stack:
-        probes = [stack.enter_context(socket.socket()) for _ in range(n)]
-        for probe in probes:
-            probe.bind(("127.0.0.1", 0))
-        return [int(probe.getsockname()[1]) for probe in probes]
 
 
 def host(topology: str, site: Site, folder: Path, port: int, tls_port: int) -> Path:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import socket
 import time
-from collections.abc import Iterator
 from contextlib import ExitStack
 from threading import Event
 
@@ -12,26 +10,15 @@ import numpy as np
 import pytest
 import zenoh
 
-from velod.config import ZenohSettings
 from velod.runtime import player
 from velod.runtime.outlet import Outlet
 from velod.runtime.player import LEAD_NS, PlayerError, play
-from velod.runtime.session import open_session
 from velod.runtime.stages import STAGES
 from velod.types import ImuPacket, Velocity
 from velod.wire import decode
 from velod.wire.topics import ALIVE, EVENTS, IMU_SENSOR, VELOCITY, key
 
 MS = 1_000_000
-
-
-@pytest.fixture
-def session() -> Iterator[zenoh.Session]:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = int(probe.getsockname()[1])
-    with open_session(ZenohSettings(port=port), introducer=True) as opened:
-        yield opened
 
 
 class FakeService:

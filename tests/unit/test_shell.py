@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import socket
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from threading import Event, Thread
@@ -17,10 +16,9 @@ import zenoh
 from velod.cli import watch
 from velod.cli.exit import EXIT_FAILED
 from velod.cli.watch import Way
-from velod.config import Settings, ZenohSettings
+from velod.config import Settings
 from velod.runtime.outlet import Outlet
 from velod.runtime.roles import SHELLS
-from velod.runtime.session import open_session
 from velod.runtime.shell import WorkerShell
 from velod.types import DepthBatch, Done, EventBatch, FlowBatch, ImuSamples, Message, Velocity
 from velod.wire import Envelope, decode
@@ -38,15 +36,6 @@ class FakeStage:
     def handle(self, message: Any) -> Sequence[Message]:
         self.counters["seen"] += 1
         return self._answer(message)
-
-
-@pytest.fixture
-def session() -> Iterator[zenoh.Session]:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = int(probe.getsockname()[1])
-    with open_session(ZenohSettings(port=port), introducer=True) as opened:
-        yield opened
 
 
 class Bench:
