@@ -24,8 +24,8 @@ def test_the_priming_message_is_large_and_arrives_where_it_is_listened_to(port: 
             arrived.set()
 
         kept = supervisor.declare_subscriber(key(PRIME, "rig0"), take)
-        prime.prime(worker, "rig0")
-        assert arrived.wait(5.0)
+        with prime.prime(worker, "rig0"):
+            assert arrived.wait(5.0)
         kept.undeclare()
     assert sizes == [prime.LARGE]
 
@@ -33,6 +33,7 @@ def test_the_priming_message_is_large_and_arrives_where_it_is_listened_to(port: 
 def test_without_a_listener_a_process_starts_all_the_same(port: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(prime, "WAIT_S", 0.1)
     with open_session(ZenohSettings(port=port), introducer=True) as session:
-        prime.prime(session, "rig0")
-        with prime.listen(session, "rig0"):
-            prime.prime(session, "rig0")
+        with prime.prime(session, "rig0"):
+            pass
+        with prime.listen(session, "rig0"), prime.prime(session, "rig0"):
+            pass

@@ -141,12 +141,14 @@ def play(
 
     Waits for the service first, and for its last velocity in the end. Raises PlayerError.
     """
-    with Service(session, rig) as service, Outlet(session, rig, lossless=speed is None) as outlet:
+    with ExitStack() as stack:
+        service = stack.enter_context(Service(session, rig))
+        outlet = stack.enter_context(Outlet(session, rig, lossless=speed is None))
         service.wait_until_up(stop)
         outlet.wait_for_subscriber(IMU_SENSOR, STALL_S)
         outlet.wait_for_subscriber(EVENTS, STALL_S, camera="left")
         outlet.wait_for_subscriber(EVENTS, STALL_S, camera="right")
-        prime(session, rig)
+        stack.enter_context(prime(session, rig))
         stop.wait(SETTLE_S)
         health = HealthReporter("driver", name)
         pace = _Pace(service, speed, stop)

@@ -8,10 +8,14 @@ and ingest, send one at their start, which all others take and ignore; ingest se
 from __future__ import annotations
 
 import logging
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import zenoh
 
+from velod.runtime import pools
 from velod.runtime.outlet import Outlet
 from velod.wire.topics import PRIME, key
 
@@ -31,10 +35,17 @@ def listen(session: zenoh.Session, rig: str) -> Any:
     return session.declare_subscriber(key(PRIME, rig), zenoh.handlers.Callback(ignore, indirect=False))
 
 
-def prime(session: zenoh.Session, rig: str) -> None:
-    """Send one large message where somebody takes it; without a taker go on after WAIT_S."""
+@contextmanager
+def prime(session: zenoh.Session, rig: str) -> Iterator[None]:
+    """Send one large message where somebody takes it, and own the memory that this made while the context lasts.
+
+    Without a taker go on after WAIT_S.
+    """
+    begun_ns = time.time_ns()
     with Outlet(session, rig) as outlet:
         if outlet.wait_for_subscriber(PRIME, WAIT_S):
             outlet.publish_bytes(PRIME, bytes(LARGE))
         else:
             log.debug("nobody takes %s: the first large message will be slow", key(PRIME, rig))
+    with pools.owned(begun_ns):
+        yield

@@ -24,6 +24,7 @@ from velod.runtime.access import SERVER, access_control, size_limits
 from velod.runtime.endpoints import ANY_HOST, Endpoint, SessionError, parse, refuse_what_is_open
 from velod.runtime.key_paths import KeyPaths
 from velod.runtime.links import keep_from_blocking
+from velod.runtime.pools import POOL_BYTES
 from velod.wire.codec import MAX_BYTES
 
 __all__ = ["SessionError", "introducer_endpoint", "open_session"]
@@ -32,7 +33,7 @@ CLIENT_WAIT_MS = 5000
 """So long may a client's first connection take."""
 SHARED_FROM_BYTES = 65_536
 """Messages so large go through shared memory: events and batches, and no worker's results. Zenoh locks the pool of
-every process that sends one into the memory of all who receive it, and keeps it there when that process has died."""
+every process that sends one into the memory of all who receive it (``pools`` gives it back when that one is gone)."""
 
 
 def open_session(settings: ZenohSettings, introducer: bool = False, rigs: Sequence[str] = ()) -> zenoh.Session:
@@ -220,7 +221,7 @@ def _transport(shared_memory: bool, lossless: bool) -> dict[str, Any]:
             "mode": "init",
             "transport_optimization": {
                 "enabled": shared_memory,
-                "pool_size": 67108864,
+                "pool_size": POOL_BYTES,
                 "message_size_threshold": SHARED_FROM_BYTES,
                 "messages": ["put"],
             },

@@ -21,6 +21,7 @@ from velod.runtime.health import HealthReporter
 from velod.runtime.inbox import Inbox, Item
 from velod.runtime.measure import GapCounter
 from velod.runtime.outlet import Outlet
+from velod.runtime.pools import PoolKeeper
 from velod.runtime.stages import Stage, alarms_of, gauges_of
 from velod.types import Message
 from velod.wire import Envelope, WireError, decode
@@ -63,6 +64,7 @@ class WorkerShell:
         self._gaps: dict[str, tuple[str, GapCounter]] = {}  # by key: topic and counter
         self._heard: dict[str, tuple[Topic, float]] = {}  # by key: when the last message came
         self._logged: set[str] = set()
+        self._pools = PoolKeeper()
         self._t_ns = 0
         self.arrived_ns = 0  # host clock, when what is being handled came in; it may have waited since
 
@@ -74,7 +76,7 @@ class WorkerShell:
             self.subscribe(stack)
             self._wait_for_consumers(stop)
             if self.sends_large:
-                prime.prime(self.session, self.rig)
+                stack.enter_context(prime.prime(self.session, self.rig))
             token = key(ALIVE, self.rig, stage=self.stage_name, worker=self.worker)
             stack.enter_context(self.session.liveliness().declare_token(token))
             log.info("up")
@@ -146,7 +148,8 @@ class WorkerShell:
         """Called after each item, and at least every ``poll_s``."""
 
     def every_second(self) -> None:
-        """Publish the health of the period that ends."""
+        """Give back the memory of the dead, and publish the health of the period that ends."""
+        self._pools.look(time.monotonic())
         health = self.health.report(self._t_ns, self.counters(), self.alarms(), self.role(), self.gauges())
         self.outlet.publish(HEALTH, health, worker=self.worker)
 

@@ -23,6 +23,7 @@ from velod.geometry.calibration import Calibration
 from velod.runtime import prime
 from velod.runtime.health import HealthReporter
 from velod.runtime.outlet import Outlet
+from velod.runtime.pools import PoolKeeper
 from velod.runtime.process import ChildProcess, LineSink, stop_all, to_stderr
 from velod.runtime.session import introducer_endpoint, open_session
 from velod.runtime.settings_service import fetch, serve
@@ -88,6 +89,7 @@ class Supervisor(Stacked):
         self._alive_lock = Lock()
         self._name = f"supervisor-{socket.gethostname().split('.')[0]}" if settings.zenoh.connect else "supervisor"
         self._health = HealthReporter("supervisor", self._name)
+        self._pools = PoolKeeper()
         self.session: Any = None
 
     def _open(self, stack: ExitStack) -> None:
@@ -120,6 +122,7 @@ class Supervisor(Stacked):
                 self._start(slot)
         self._keep_a_spare()
         if self._health.due_in_s() == 0.0:
+            self._pools.look(time.monotonic())
             health = self._health.report(0, self._counters(), self._alarms())
             self._outlet.publish(HEALTH, health, worker=self._name)
 
