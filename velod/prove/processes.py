@@ -15,6 +15,15 @@ def resident_mib(pid: int) -> float:
     return (int(resident) - int(shared)) * os.sysconf("SC_PAGE_SIZE") / (1 << 20)
 
 
+def held_mib(pid: int) -> float:
+    """Resident memory of its own and what it holds of shared memory, its own or that of others, MiB."""
+    try:
+        fields = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines())
+        return sum(int(fields[name].split()[0]) for name in ("RssAnon", "RssShmem")) / 1024.0
+    except (OSError, KeyError):  # one that has ended and was not waited for has no memory
+        return 0.0
+
+
 def cpu_s(pid: int) -> float:
     """CPU time since its start, s."""
     try:
