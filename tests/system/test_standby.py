@@ -7,7 +7,6 @@ import signal
 import time
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,11 +22,12 @@ pytestmark = [pytest.mark.system, pytest.mark.skipif(bool(why_not()), reason=why
 SECONDS = 9.0
 
 
-@pytest.fixture
-def rig(tmp_path: Path) -> Iterator[Rig]:
-    recording = slanted_scene.write(tmp_path / "slanted.h5", SECONDS)
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
+    directory = tmp_path_factory.mktemp("standby")
+    recording = slanted_scene.write(directory / "slanted.h5", SECONDS)
     with Network("compute", "consumer") as network:
-        rig = Rig(network, recording, tmp_path, replace(Settings(), optimizer=OptimizerSettings(workers=2)))
+        rig = Rig(network, recording, directory, replace(Settings(), optimizer=OptimizerSettings(workers=2)))
         rig.start_service()
         yield rig
 
@@ -37,6 +37,13 @@ def leader(rig: Rig) -> int:
     pids = {h["role"]: h["pid"] for h in rig.seen_so_far().newest_health().values() if h["stage"] == "optimizer"}
     assert sorted(pids) == ["leads", "standby"]
     return int(pids["leads"])
+
+
+def test_a_service_is_at_work_before_it_loads_those_that_stand_by(rig: Rig) -> None:
+    """All at once, the first of each stage would come as late as the last."""
+    log = rig.log("service")
+    firsts = [log.index(f"{worker}-0 INFO up") for worker in ("ingest", "flow", "depth", "optimizer")]
+    assert log.index("optimizer-1: process") > max(firsts)
 
 
 def test_whatever_happens_to_the_leader_consumers_see_one_stream(rig: Rig) -> None:

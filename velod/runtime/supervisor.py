@@ -39,6 +39,8 @@ POLL_S = 0.02
 FIRST_DELAY_S, LAST_DELAY_S = 0.1, 10.0
 STEADY_S = 10.0
 """A worker that lived so long starts with no delay again."""
+HEAD_START_S = 10.0
+"""So long at the most do a stage's further workers wait for the first of each: all at once, all would come late."""
 REMEMBERED_S = 60.0
 """A death stays an alarm in health for so long."""
 
@@ -83,6 +85,7 @@ class Supervisor(Stacked):
         self._stages, self._worker, self._wants_spare = tuple(stages), worker, spare
         self._on_line = on_line
         self._slots: dict[str, _Slot] = {}
+        self._further: list[_Slot] = []  # not yet started: a stage's second workers and so on
         self._spare: ChildProcess | None = None
         self._spare_is_known = False  # to be ready: said once
         self._alive: set[tuple[str, str]] = set()
@@ -105,7 +108,10 @@ class Supervisor(Stacked):
         stack.enter_context(prime.listen(self.session, self._settings.rig.name))
         stack.callback(self.stop_workers)
         for name in self._names():
-            self._slots[name] = _Slot(name)
+            self._slots[name] = slot = _Slot(name)
+            if any(stage_of(name) == stage_of(other) for other in self._slots if other != name):
+                slot.due_s = time.monotonic() + HEAD_START_S
+                self._further.append(slot)
         self.step()
 
     def run(self, stop: Event) -> None:
@@ -115,6 +121,10 @@ class Supervisor(Stacked):
 
     def step(self) -> None:
         """Restart what has died, keep a spare, report health once a second."""
+        if self._further and self._firsts_are_up():
+            for slot in self._further:
+                slot.due_s = 0.0
+            self._further.clear()
         for slot in self._slots.values():
             if slot.process is not None and slot.process.exit_code() is not None:
                 self._bury(slot)
@@ -131,6 +141,12 @@ class Supervisor(Stacked):
         with self._alive_lock:
             alive = set(self._alive)
         return {stage_of(w) for _, w in alive} >= set(stages) and {w for _, w in alive} >= set(self._slots)
+
+    def _firsts_are_up(self) -> bool:
+        """Whether all but those that wait for them are alive."""
+        with self._alive_lock:
+            alive = {worker for _, worker in self._alive}
+        return alive >= set(self._slots) - {slot.worker for slot in self._further}
 
     def trouble(self, deaths: int = 3) -> str:
         """Which worker does not stay alive, and why; empty while none has died ``deaths`` times in a row."""
