@@ -54,7 +54,8 @@ def test_the_unit_and_the_container_type_commands_that_velod_has() -> None:
     unit = (DEPLOY / "systemd" / "velod.service").read_text("utf-8")
     compose = yaml.safe_load((DEPLOY / "compose.yaml").read_text("utf-8"))
     container = (DEPLOY / "Containerfile").read_text("utf-8")
-    commands = re.findall(r"^Exec\w+=\S+/velod (\w+)", unit, re.M) + re.findall(r"^RUN velod (\w+)", container, re.M)
+    commands = re.findall(r"^Exec\w+=.*?/bin/velod (\w+)", unit, re.M)
+    commands += re.findall(r"^RUN velod (\w+)", container, re.M)
     commands += [
         re.search(r'^CMD \["(\w+)"', container, re.M)[1],
         compose["services"]["velod"]["healthcheck"]["test"][2],
