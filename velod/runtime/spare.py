@@ -3,19 +3,23 @@
 It reads one line of JSON from stdin, ``{"become": "flow-0"}``. A fresh process would need seconds to import and to
 load kernels; the spare is at work in a fraction of one. What it loads, it loads in threads of low priority (Linux
 keeps a niceness per thread), so as not to slow the workers; the main thread, which will be a worker, only waits.
-For the same reason this module imports nothing but the standard library at first.
+For the same reason this module imports the standard library and next to nothing of velod at first.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import select
 import sys
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from threading import Event
 from typing import TYPE_CHECKING, TypeVar
+
+from velod.runtime.parent import die_with
 
 if TYPE_CHECKING:
     from velod.config import Settings
@@ -31,6 +35,7 @@ T = TypeVar("T")
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Wait, then be a worker; returns the exit code."""
+    _die_with_supervisor(argv)
     quietly(_import_all)
     from velod.runtime import worker
     from velod.runtime.session import open_session
@@ -55,6 +60,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         worker.log.error("%s", e)
         return worker.EXIT_USAGE
     return 0
+
+
+def _die_with_supervisor(argv: Sequence[str] | None) -> None:
+    """At once: what follows may take seconds, and a supervisor that dies meanwhile leaves nothing."""
+    parser = argparse.ArgumentParser(add_help=False)
+    parser.add_argument("--parent", type=int, default=0)
+    with suppress(OSError):  # it is said later, with a log
+        die_with(parser.parse_known_args(argv)[0].parent)
 
 
 def quietly(work: Callable[[], T]) -> T:

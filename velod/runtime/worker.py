@@ -17,13 +17,13 @@ import zenoh
 from velod.config import Settings, ZenohSettings
 from velod.runtime import warmup
 from velod.runtime.access import ROLES
+from velod.runtime.parent import die_with
 from velod.runtime.roles import SHELLS
 from velod.runtime.session import introducer_endpoint, open_session
 from velod.runtime.settings_service import fetch
 from velod.runtime.stages import Stage, create_stage, stage_of
 
 EXIT_USAGE = 2
-_PR_SET_PDEATHSIG = 1
 _SWITCH_INTERVAL_S = 0.0005
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 _KEPT_BYTES = 32 << 20
@@ -127,10 +127,7 @@ def start_logging(worker: str) -> None:
 
 def prepare_process(parent: int) -> None:
     """Die with the parent (Linux), hand the interpreter lock over quickly, find a place for compiled kernels."""
-    if parent and sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-        if os.getppid() != parent:
-            raise OSError(f"the supervisor (process {parent}) is gone")
+    die_with(parent)
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
     keep_memory()
     warmup.ensure_cache_directory()
