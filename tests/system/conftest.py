@@ -13,7 +13,7 @@ from tests import slanted_scene
 from velod.config import DepthSettings, FlowSettings, Settings, ZenohSettings
 
 BOXES = Path(__file__).parents[3] / "shared" / "data" / "boxes_esim.h5"
-CALM_S = 60.0
+CALM_S = 20.0
 
 
 @pytest.fixture
