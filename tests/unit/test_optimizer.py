@@ -241,6 +241,29 @@ def test_a_sensor_that_comes_to_rest_stays_known():
     assert np.trace(without[-1].cov) > 20 * np.trace(with_it[-1].cov)
 
 
+def with_event_rate(stream, hz):
+    """The stream with ``hz`` events per pixel, too few to select any of."""
+    pixels, t_ns = CALIBRATION.left.width * CALIBRATION.left.height, 0
+    for m in stream:
+        if isinstance(m, FlowBatch):
+            m, t_ns = replace(m, n_events=round(hz * pixels * (m.t_ns - t_ns) * 1e-9)), m.t_ns
+        yield m
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.05])
+def test_a_creep_that_gives_events_but_no_flow_is_covered(turn):
+    """At 0.11 m/s and 0.05 rad/s edges are too slow to select; one event per pixel and second tells of it."""
+    creeping = Motion(np.array([0.0, turn, 0.0]), np.array([0.11, 0.0, 0.0]), np.zeros(3), np.ones(3))
+    velocities, stage = run(with_event_rate(messages(creeping, 1.5, dark=(0.0, 9.0)), 1.0))
+    assert stage.counters["standstill"] > 50
+    squared = [
+        (v.v_B - creeping.v_B(v.t_ns * 1e-9)) @ np.linalg.solve(v.cov, v.v_B - creeping.v_B(v.t_ns * 1e-9))
+        for v in velocities
+    ]
+    # 3.5 sigma; with a limit to what a creep may be it was 9 sigma
+    assert max(squared) < 12.0
+
+
 def test_a_dark_flight_is_not_taken_for_rest():
     _, stage = run(messages(FLIGHT, 1.2, dark=(0.5, 1.2)))
     assert "standstill" not in stage.counters

@@ -412,10 +412,11 @@ class Estimator:
         since_ns = max(self._still_to, t_ns - QUIET_NS)
         gyro = self.memory.gyro[self.memory.between(since_ns, t_ns)]
         if len(gyro):
-            # what the gyroscope says is its bias, and noise of the density over the root of the time
-            information = (t_ns - since_ns) * 1e-9 / self._imu.gyro_noise**2
+            # what the gyroscope says is its bias, noise of the density over the root of the time, and a slow turn
+            variance = self._imu.gyro_noise**2 / ((t_ns - since_ns) * 1e-9)
+            variance += (self._standstill.unseen_px_s / self.camera[0]) ** 2
             J = self.window.selector(t_ns)[6:9]
-            self.window.add(J, gyro.mean(axis=0), np.eye(3) * information)
+            self.window.add(J, gyro.mean(axis=0), np.eye(3) / variance)
         self._still_to = t_ns
         self._weak_L = np.empty((0, 3))
         self._count("standstill")

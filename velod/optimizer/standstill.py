@@ -21,8 +21,8 @@ MAX_EVENT_HZ = 2.0
 """Events per pixel and second beyond which noise cannot be told from slow motion."""
 EVENTS_PER_PX = 0.05
 """Events per pixel of the sensor that one pixel of motion causes at the least: a few edges, some too faint."""
-STILL_SIGMA, CREEP_SIGMA = 0.0005, 0.05
-"""Of a velocity observed as zero at the end of one batch, m/s: without an event, and with events of noise."""
+STILL_SIGMA = 0.0005
+"""Of a velocity observed as zero at the end of one batch without an event, m/s."""
 SIGMAS = 4.0
 """Spread of the samples, in sigmas of the sensor's noise, up to which it is noise ..."""
 GYRO_FLOOR, ACCEL_FLOOR = 0.005, 0.05
@@ -54,10 +54,14 @@ class Standstill:
         self.dark = False
         self._rests = False  # at the end of the newest batch
 
+    @property
+    def unseen_px_s(self) -> float:
+        """Image motion of which nothing is selected and that would cause no more events than the newest batch has."""
+        return self._event_hz / EVENTS_PER_PX
+
     def sigma(self, m_per_px: float) -> float:
         """How far from zero the velocity may be at the end of the newest batch, m/s; ``m_per_px``: depth over f."""
-        unseen_mps = self._event_hz / EVENTS_PER_PX * m_per_px
-        return min(max(STILL_SIGMA, unseen_mps), CREEP_SIGMA)
+        return max(STILL_SIGMA, self.unseen_px_s * m_per_px)
 
     def detected(self, flow: FlowBatch, memory: InertialMemory, b_w: F64, predicted: tuple[F64, F64] | None) -> bool:
         """Whether the sensor rests at the end of this batch, the next after the one asked about before.
