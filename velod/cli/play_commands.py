@@ -129,6 +129,7 @@ def _add_sim(commands: Commands) -> None:
         "  velod sim boxes-4 -o rough.h5 --noise 1 --leak 0.1 --bandwidth 300 --jitter 20 --imu-hz 1000\n"
         "  velod sim hover-1 -o hover.h5 --texture 5 --seed 2\n"
         "  velod sim boxes-4 -o large.h5 --sensor 640x480 --seconds 1\n"
+        "  velod sim spin-2 -o smooth.h5 --rays 2 --seconds 1\n"
         "  velod sim corridor-1 -o lens.h5 --distortion=-0.35,0.15,0,0,0",
     )
     parser.add_argument("sequence", metavar="SEQUENCE")

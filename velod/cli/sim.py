@@ -25,13 +25,18 @@ _EFFECTS: tuple[tuple[str, str, Callable[[str], object], str, str], ...] = (
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Sensor, texture, IMU rate, contrast threshold and real-sensor effects."""
+    """Sensor, rays, texture, IMU rate, contrast threshold and real-sensor effects."""
     parser.add_argument(
         "--imu-hz", type=int, metavar="HZ", help="rate of the IMU, a divisor of 1,000,000 (default 200)"
     )
     parser.add_argument(
         "--sensor", type=_size, default=(346, 260), metavar="WxH",
         help="columns and rows of both cameras, such as 640x480 (default 346x260)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--rays", type=int, default=1, metavar="K",
+        help="a pixel's light is the mean over K x K rays, not one at its centre (1 to 4, default 1): outlines then "
+        "cross it gradually, as on a real sensor; K = 2 takes three times as long",
     )  # fmt: skip
     parser.add_argument("--texture", type=int, metavar="SEED", help="other leaves on walls and boxes")
     parser.add_argument("--threshold", type=float, metavar="C", help="contrast at which pixels fire (default 0.5)")
@@ -69,7 +74,15 @@ def recipe_of(args: argparse.Namespace) -> Sequence:
         events = replace(events, threshold_sigma=args.threshold_spread)
     if args.imu_hz is not None:
         imu = replace(imu, rate_hz=args.imu_hz)
-    return replace(recipe, trajectory=trajectory, effects=effects, events=events, imu=imu, sensor=args.sensor)
+    return replace(
+        recipe,
+        trajectory=trajectory,
+        effects=effects,
+        events=events,
+        imu=imu,
+        sensor=args.sensor,
+        rays_per_side=args.rays,
+    )
 
 
 def _size(text: str) -> tuple[int, int]:

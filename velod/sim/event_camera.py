@@ -7,9 +7,9 @@ from numba import njit
 
 from velod.geometry.calibration import Camera
 from velod.io.model import EventColumns
+from velod.sim.area import renderer_of
 from velod.sim.effects import Effects
 from velod.sim.events import EventModel, EventSensor
-from velod.sim.render import Renderer
 from velod.sim.scene import Scene
 from velod.sim.texture import Texture
 from velod.types import F32, F64, I64
@@ -40,8 +40,9 @@ class EventCamera:
         effects: Effects,
         offset_B: F64,
         rng: np.random.Generator,
+        rays_per_side: int,
     ) -> None:
-        self._renderer = Renderer(scene, texture, camera)
+        self._renderer = renderer_of(scene, texture, camera, rays_per_side)
         self._sensor = EventSensor(model, effects, camera.width, camera.height, rng)
         self._camera = camera
         self._offset_B = offset_B

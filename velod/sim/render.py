@@ -36,25 +36,14 @@ class Renderer:
         self._texture = texture
         self._starts = texture.offset.astype(np.uint32)
         self._surfaces = scene.surfaces.astype(np.float32)
-        if camera.width > _ROW:
-            raise ValueError(f"the widest image that can be rendered has {_ROW} pixels in a row, got {camera.width}")
-        self._work: F32 = np.empty(5 * _ROW, np.float32)
+        if camera.width > MAX_ROW:
+            raise ValueError(f"at most {MAX_ROW} rays can be cast in a row, got {camera.width}")
+        self._work: F32 = np.empty(5 * MAX_ROW, np.float32)
 
     def render(self, R_WC: F64, p_WC: F64, areas: I64) -> None:
         """Bring ``areas`` up to date for a camera at ``p_WC`` (m, in W) with axes ``R_WC``."""
         R_WC, p_WC = np.ascontiguousarray(R_WC), np.ascontiguousarray(p_WC)
-        cast_shell_and_boxes(
-            self._scene.shell,
-            self._scene.boxes,
-            R_WC,
-            p_WC,
-            self._rays,
-            areas,
-            self._aimed,
-            1.0 / self._focal[0],
-            self.depth,
-            self.surface,
-        )
+        self.cast(R_WC, p_WC, areas)
         _shade(
             self._surfaces,
             self._texture.texels,
@@ -69,6 +58,21 @@ class Renderer:
             self.surface,
             self.intensity,
             self._work,
+        )
+
+    def cast(self, R_WC: F64, p_WC: F64, areas: I64) -> None:
+        """As ``render``, but for the intensity, which stays as it was."""
+        cast_shell_and_boxes(
+            self._scene.shell,
+            self._scene.boxes,
+            np.ascontiguousarray(R_WC),
+            np.ascontiguousarray(p_WC),
+            self._rays,
+            areas,
+            self._aimed,
+            1.0 / self._focal[0],
+            self.depth,
+            self.surface,
         )
 
 
@@ -275,10 +279,11 @@ def cast_shell_and_boxes(
         _cast_boxes(aimed, margin, rays, areas, depth, surface)
 
 
-_ROW = 2048
+MAX_ROW = 2048
+"""Rays beside each other that can be cast."""
 # Parts of the work array: place on the texture (texels), half the way between its two samples, footprint squared.
 # They lie a constant apart in one array: so LLVM sees that they do not overlap, and vectorises.
-_U, _V, _HALF_U, _HALF_V, _FOOTPRINT2 = (np.uint64(part * _ROW) for part in range(5))
+_U, _V, _HALF_U, _HALF_V, _FOOTPRINT2 = (np.uint64(part * MAX_ROW) for part in range(5))
 
 
 # Single precision throughout, and in runs of pixels that see one surface, so that LLVM vectorises what it can: half

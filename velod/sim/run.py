@@ -90,7 +90,9 @@ def _render(
     scene, camera, texture = sequence.scene, sequence.calibration.left, make_texture(sequence.texture)
     effects = sequence.effects
     left, right = (
-        EventCamera(scene, texture, camera, sequence.events, effects, np.array([x_m, 0.0, 0.0]), rng)
+        EventCamera(
+            scene, texture, camera, sequence.events, effects, np.array([x_m, 0.0, 0.0]), rng, sequence.rays_per_side
+        )
         for x_m, rng in ((0.0, left_rng), (BASELINE_M, right_rng))
     )
     at_us = 0
