@@ -187,6 +187,45 @@ def test_imu_times_that_do_not_increase_are_refused(path: Path) -> None:
         open_recording(path)
 
 
+def test_a_counter_that_rolled_over_is_named(path: Path) -> None:
+    with h5py.File(path, "r+") as file:
+        file["events/left/t"][...] = (file["events/left/t"][:] + 2**32 - 50_000) % 2**32
+    with pytest.raises(RecordingError, match=r"/events/left: event times go backwards: .* rolled over"):
+        open_recording(path)
+
+
+@pytest.mark.parametrize("name", ["events/left/t", "imu/t_us"])
+def test_a_time_that_leaps_is_refused_instead_of_waited_for(path: Path, name: str) -> None:
+    with h5py.File(path, "r+") as file:
+        file[name][-1] = 10**15
+    with pytest.raises(RecordingError, match=r"21 IMU samples over 1e[+]09 s"):
+        open_recording(path)
+
+
+def test_imu_times_in_seconds_are_refused(path: Path) -> None:
+    with h5py.File(path, "r+") as file:
+        t_s = file["imu/t_us"][:] * 1e-6
+        del file["imu/t_us"]
+        file["imu/t_us"] = t_s
+    with pytest.raises(RecordingError, match="imu/t_us holds fractions, expected whole microseconds"):
+        open_recording(path)
+
+
+def test_a_damaged_block_is_not_taken_for_a_missing_filter(path: Path) -> None:
+    with h5py.File(path) as file:
+        chunk = file["events/left/t"].id.get_chunk_info(0)
+    raw = bytearray(path.read_bytes())
+    raw[chunk.byte_offset : chunk.byte_offset + chunk.size] = bytes(chunk.size)
+    path.write_bytes(raw)
+    with pytest.raises(RecordingError, match=r"sequence\.h5: damaged"):
+        open_recording(path)
+
+
+def test_a_directory_in_the_place_of_the_file_is_said_before_anything_is_written(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="cannot be written: is a directory"):
+        write_recording(tmp_path, sequence())
+
+
 def test_streams_on_different_clocks_are_refused(path: Path) -> None:
     with h5py.File(path, "a") as file:
         file["imu/t_us"][...] = file["imu/t_us"][:] + 10_000_000
@@ -254,6 +293,8 @@ def test_dsec_without_an_imu_says_that_velod_needs_one(tmp_path: Path) -> None:
         ("intrinsics: {}", "cam0 is missing"),
         ("]", "not a DSEC calibration"),
         ("[]", "not a DSEC calibration"),
+        ("intrinsics: {cam0: {distortion_model: radtan}}", "cam0: camera_matrix is missing"),
+        ("intrinsics: {cam0: {distortion_model: radtan, camera_matrix: [1]}}", "camera_matrix holds 1 numbers"),
     ],
 )
 def test_a_broken_dsec_calibration_names_the_cause(tmp_path: Path, text: str, cause: str) -> None:
@@ -311,6 +352,10 @@ def test_a_text_recording_without_a_baseline_is_refused(tmp_path: Path) -> None:
     [
         ("events.txt", "0.1 3 4 1\n0.2 spam 4 1\n", "not numbers"),
         ("events.txt", "0.1 3 4\n", "3 numbers a line, expected 4"),
+        ("events.txt", "346 260\n0.1 3 4 1\n", "not numbers"),
+        ("events.txt", "0.1 3 4 1\nnan 3 4 1\n", "not finite numbers: 'nan 3 4 1"),
+        ("events.txt", "1500000000000000 3 4 1\n", "a time of 1.5e[+]15 s: are the times seconds"),
+        ("events.txt", "3 4 1 0.2\n1 4 1 0.2\n", "event times go backwards: the first is 3.000 s"),
         ("imu.txt", "", "is empty"),
         ("imu.txt", "0.1 0 0 0 0 0 0\n0.1 0 0 0 0 0 0\n", "times do not increase at line 2"),
     ],
@@ -321,3 +366,31 @@ def test_broken_text_names_file_and_cause(tmp_path: Path, name: str, text: str, 
     (tmp_path / "left" / name).write_text(text)
     with pytest.raises(RecordingError, match=f"{name}: {cause}"):
         list(open_recording(tmp_path, calibration=calibration()).packets())
+
+
+def test_blank_lines_and_comments_are_no_events(tmp_path: Path) -> None:
+    for side, seed in (("left", 1), ("right", 2)):
+        write_text(tmp_path / side, seed)
+        for file in (tmp_path / side).iterdir():
+            file.write_text(f"# t x y p\n{file.read_text()}\n\n")
+    assert open_recording(tmp_path, calibration=calibration()).n_events == 4000
+
+
+def test_text_in_another_encoding_is_named(tmp_path: Path) -> None:
+    write_text(tmp_path / "left", 1)
+    write_text(tmp_path / "right", 2)
+    (tmp_path / "right" / "events.txt").write_text("0.1 3 4 1\n", encoding="utf-16")
+    with pytest.raises(RecordingError, match=r"events\.txt: not plain text in UTF-8"):
+        open_recording(tmp_path, calibration=calibration())
+
+
+def test_text_with_times_in_microseconds_is_refused_instead_of_played_for_days(tmp_path: Path) -> None:
+    for side in ("left", "right"):
+        write_text(tmp_path / side, 1)
+        for name in ("events.txt", "imu.txt"):
+            file = tmp_path / side / name
+            table = np.loadtxt(file, ndmin=2)
+            table[:, 0] *= 1e6
+            np.savetxt(file, table, fmt="%g")
+    with pytest.raises(RecordingError, match=r"IMU samples over .*text: s"):
+        open_recording(tmp_path, calibration=calibration())

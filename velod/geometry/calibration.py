@@ -81,6 +81,9 @@ DIST_LENGTHS = {"none": (0,), "radtan": (4, 5), "equi": (4,)}
 
 MAX_TIME_OFFSET_S = 1.0
 
+MAX_LENGTH_M = 5.0
+"""No rig that one carries or drives is wider; one whose numbers are millimetres is, from 5 mm on."""
+
 
 def checked(calib: Calibration, source: str) -> Calibration:
     """The same calibration if it is usable. Raises CalibrationError naming ``source``, the field and the reason."""
@@ -97,11 +100,17 @@ def checked(calib: Calibration, source: str) -> Calibration:
         )
     if -t_RL[0] < 0.7 * float(np.linalg.norm(t_RL)):
         raise CalibrationError(f"{source}: t_RL: the cameras must lie side by side along x, got {t_RL.tolist()}")
+    if np.linalg.norm(t_RL) > MAX_LENGTH_M:
+        raise CalibrationError(f"{source}: t_RL: a baseline of {-t_RL[0]:g} m; lengths are metres: are these mm?")
     if calib.T_cam_imu.shape != (4, 4) or not np.isfinite(calib.T_cam_imu).all():
         raise CalibrationError(f"{source}: T_cam_imu: must be 4x4 finite numbers")
     if not np.array_equal(calib.T_cam_imu[3], [0.0, 0.0, 0.0, 1.0]):
         raise CalibrationError(f"{source}: T_cam_imu: last row must be 0 0 0 1, got {calib.T_cam_imu[3].tolist()}")
     _check_rotation(calib.T_cam_imu[:3, :3], f"{source}: T_cam_imu")
+    if (arm_m := float(np.linalg.norm(calib.T_cam_imu[:3, 3]))) > MAX_LENGTH_M:
+        raise CalibrationError(
+            f"{source}: T_cam_imu: the IMU is {arm_m:g} m from the camera; lengths are metres: are these mm?"
+        )
     for name, T in calib.frames.items():
         _check_rotation(T[:3, :3], f"{source}: frames: {name}")
     if not abs(calib.time_offset_s) <= MAX_TIME_OFFSET_S:
@@ -239,6 +248,8 @@ def _check_ros_baseline(calib: Calibration, right: dict[str, Any], source: str) 
     if "projection_matrix" not in right:
         return
     P = _ros_matrix(right["projection_matrix"], (3, 4), f"{source}: projection_matrix")
+    if not P[0, 0] > 0.0:
+        raise CalibrationError(f"{source}: projection_matrix: focal length must be positive, got {P[0, 0]:g}")
     b_P, b_T = -P[0, 3] / P[0, 0], float(np.linalg.norm(calib.t_RL))
     # 1 % of the baseline is 1 % of the velocity.
     if abs(b_P - b_T) > 0.01 * b_T:

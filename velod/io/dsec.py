@@ -56,8 +56,8 @@ def read_calibration(path: Path, T_cam_imu: F64) -> Calibration:
     """``cam_to_cam.yaml``: cam0 is the left, cam3 the right event camera; T_ba maps from camera a to camera b."""
     try:
         tree = yaml.safe_load(path.read_text())
-        left, right = (_camera(tree["intrinsics"][name]) for name in ("cam0", "cam3"))
-        T_10, T_21, T_32 = (np.array(tree["extrinsics"][name], dtype=np.float64) for name in ("T_10", "T_21", "T_32"))
+        left, right = (_camera(tree["intrinsics"][name], name) for name in ("cam0", "cam3"))
+        T_10, T_21, T_32 = (_transform(tree["extrinsics"][name], name) for name in ("T_10", "T_21", "T_32"))
         T_30 = T_32 @ T_21 @ T_10
     except KeyError as e:
         raise CalibrationError(f"{path}: {e.args[0]} is missing") from None
@@ -66,10 +66,26 @@ def read_calibration(path: Path, T_cam_imu: F64) -> Calibration:
     return checked(Calibration(left, right, T_30[:3, :3], T_30[:3, 3], T_cam_imu), str(path))
 
 
-def _camera(tree: dict[str, Any]) -> Camera:
+def _camera(tree: dict[str, Any], name: str) -> Camera:
     if tree["distortion_model"] != "radtan":
-        raise ValueError(f"distortion model {tree['distortion_model']!r}, expected radtan")
-    fx, fy, cx, cy = (float(v) for v in tree["camera_matrix"])
-    width, height = (int(v) for v in tree["resolution"])
-    k1, k2, p1, p2 = (float(v) for v in tree["distortion_coeffs"])
+        raise ValueError(f"{name}: distortion model {tree['distortion_model']!r}, expected radtan")
+    fx, fy, cx, cy = _numbers(tree, "camera_matrix", 4, name)
+    width, height = (int(v) for v in _numbers(tree, "resolution", 2, name))
+    k1, k2, p1, p2 = _numbers(tree, "distortion_coeffs", 4, name)
     return Camera(width, height, fx, fy, cx, cy, "radtan", (k1, k2, p1, p2, 0.0))
+
+
+def _numbers(tree: dict[str, Any], key: str, n: int, camera: str) -> list[float]:
+    if key not in tree:
+        raise ValueError(f"{camera}: {key} is missing")
+    values = [float(v) for v in tree[key]]
+    if len(values) != n:
+        raise ValueError(f"{camera}: {key} holds {len(values)} numbers, expected {n}")
+    return values
+
+
+def _transform(value: Any, name: str) -> F64:
+    T = np.array(value, dtype=np.float64)
+    if T.shape != (4, 4):
+        raise ValueError(f"{name}: must be 4x4 numbers")
+    return T

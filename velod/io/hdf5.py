@@ -50,6 +50,8 @@ def _cause(path: Path, message: str) -> str:
         return "truncated HDF5 file (was the copy interrupted?)"
     if "signature not found" in message:
         return "not an HDF5 file"
+    if "filter returned failure" in message:
+        return "damaged: what is stored cannot be decompressed"
     if "filter" in message.lower():
         return "compressed with a filter that is not installed: pip install 'velod[h5]'"
     return f"cannot be read: {message.splitlines()[0] if message else 'unknown cause'}"
@@ -76,8 +78,11 @@ def same_length(path: Path, group: str, columns: dict[str, Any]) -> int:
 
 
 def increasing_ns(t_us: Any, path: Path, name: str) -> I64:
-    """File microseconds -> ns; they must increase."""
-    t_ns: I64 = np.asarray(t_us).astype(np.int64) * 1000
+    """File microseconds -> ns; they must be whole, and increase."""
+    t_us = np.asarray(t_us)
+    if t_us.dtype.kind == "f" and not np.array_equal(t_us, np.rint(t_us)):
+        raise RecordingError(f"{path}: /{name} holds fractions, expected whole microseconds")
+    t_ns: I64 = t_us.astype(np.int64) * 1000
     step = np.diff(t_ns)
     if len(step) and step.min() <= 0:
         i = int(np.argmax(step <= 0)) + 1

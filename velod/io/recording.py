@@ -14,6 +14,9 @@ from velod.types import NS_PER_S, EventPacket, ImuPacket
 
 FORMATS = ("sequence", "dsec", "text")
 
+_MIN_IMU_HZ = 10.0
+"""Over the whole recording. IMUs give 100 Hz and more; times in a wrong unit, or one that leaps, give nearly none."""
+
 
 @dataclass(frozen=True, slots=True)
 class Recording:
@@ -79,7 +82,7 @@ def open_recording(
     else:
         raise RecordingError(f"{path}: unknown format {kind!r}; known: {', '.join(FORMATS)}")
     recording = Recording(path, parts.calibration, parts.left, parts.right, parts.imu, parts.truth)
-    _check_overlap(recording)
+    _check_times(recording)
     return recording
 
 
@@ -95,13 +98,24 @@ def _guess(path: Path) -> str:
     )
 
 
-def _check_overlap(recording: Recording) -> None:
+def _check_times(recording: Recording) -> None:
     for source in (recording.left, recording.right):
         if source.n_events == 0:
             raise RecordingError(f"{source.name}: no events")
+        if source.last_t_ns < source.first_t_ns:
+            raise RecordingError(
+                f"{source.name}: event times go backwards: the first is {source.first_t_ns / 1e9:.3f} s, the last "
+                f"{source.last_t_ns / 1e9:.3f} s; a counter that rolled over, or columns in another order?"
+            )
         if source.first_t_ns > int(recording.imu.t_ns[-1]) or source.last_t_ns < int(recording.imu.t_ns[0]):
             raise RecordingError(
                 f"{recording.path}: clocks differ: events of {source.name} span "
                 f"{source.first_t_ns / 1e9:.3f} to {source.last_t_ns / 1e9:.3f} s, the IMU "
                 f"{recording.imu.t_ns[0] / 1e9:.3f} to {recording.imu.t_ns[-1] / 1e9:.3f} s"
             )
+    n_imu = len(recording.imu.t_ns)
+    if n_imu < _MIN_IMU_HZ * recording.duration_s - 1.0:
+        raise RecordingError(
+            f"{recording.path}: {n_imu} IMU samples over {recording.duration_s:g} s: are the times in the format's "
+            "unit (text: s, HDF5: us), and does none of them leap?"
+        )

@@ -65,7 +65,7 @@ def read_calibration(file: Any, path: Path) -> Calibration:
         dist,
     )
     T_cam_imu = np.asarray(attrs.get("T_cam_imu", np.eye(4)), dtype=np.float64)
-    offset_s = float(attrs.get("time_offset_s", 0.0))
+    offset_s = _number(attrs, "time_offset_s", path) if "time_offset_s" in attrs else 0.0
     stated = Calibration(camera, camera, np.eye(3), np.array([-number["baseline_m"], 0.0, 0.0]), T_cam_imu, offset_s)
     return checked(stated, f"{path}:/calib")
 
@@ -135,6 +135,8 @@ class RecordingWriter:
         self._part = self._path.with_name(f"{self._path.name}.part{os.getpid()}")
         self._pending: dict[str, list[EventColumns]] = {"left": [], "right": []}
         self._finished = False
+        if self._path.is_dir():
+            raise RecordingError(f"{self._path}: cannot be written: is a directory")
         try:
             self._file = h5py.File(self._part, "w")
         except OSError as e:

@@ -22,6 +22,9 @@ from velod.types import F64, I64
 BLOCK = 1 << 17
 """Lines read at a time."""
 
+_MAX_T_S = 9e9
+"""Nanoseconds in 64 bits hold 9.2e9 s; seconds since 1970 are 1.8e9."""
+
 
 def read(path: Path, right: Path | None, calibration: Calibration | None) -> Parts:
     """Calibration, left and right events, IMU and truth. Raises RecordingError, CalibrationError.
@@ -72,22 +75,32 @@ class TextEvents:
         if not path.is_file():
             raise RecordingError(f"{path}: no such file")
         n, first, last = 0, "", ""
-        with path.open() as file:
-            for line in file:
-                first, last, n = first or line, line, n + 1
-        first_t_ns, last_t_ns = _ns(_table([first, last], 4, path)[:, 0]) if n else (0, 0)
+        for line in _lines(path):
+            first, last, n = first or line, line, n + 1
+        first_t_ns, last_t_ns = _ns(_table([first, last], 4, path)[:, 0], path) if n else (0, 0)
         return TextEvents(str(path), n, int(first_t_ns), int(last_t_ns), path)
 
     def blocks(self) -> Iterator[EventColumns]:
-        with self.path.open() as file:
-            while lines := list(islice(file, BLOCK)):
-                table = _table(lines, 4, self.path)
-                yield EventColumns(
-                    _ns(table[:, 0]),
-                    pixels(table[:, 1], self.name),
-                    pixels(table[:, 2], self.name),
-                    table[:, 3].astype(np.int64).astype(np.uint8),
-                )
+        rest = _lines(self.path)
+        while lines := list(islice(rest, BLOCK)):
+            table = _table(lines, 4, self.path)
+            yield EventColumns(
+                _ns(table[:, 0], self.path),
+                pixels(table[:, 1], self.name),
+                pixels(table[:, 2], self.name),
+                table[:, 3].astype(np.int64).astype(np.uint8),
+            )
+
+
+def _lines(path: Path) -> Iterator[str]:
+    """The lines that hold something: neither blank nor a comment. Raises RecordingError."""
+    try:
+        with path.open(encoding="utf-8") as file:
+            for line in file:
+                if not line.isspace() and not line.startswith("#"):
+                    yield line
+    except UnicodeDecodeError:
+        raise RecordingError(f"{path}: not plain text in UTF-8") from None
 
 
 def _table(lines: list[str], columns: int, path: Path) -> F64:
@@ -97,17 +110,21 @@ def _table(lines: list[str], columns: int, path: Path) -> F64:
         raise RecordingError(f"{path}: not numbers: {str(e).splitlines()[0]}") from None
     if table.shape[1] != columns:
         raise RecordingError(f"{path}: {table.shape[1]} numbers a line, expected {columns}")
+    if not np.isfinite(table).all():
+        raise RecordingError(f"{path}: not finite numbers: {lines[int(np.argmin(np.isfinite(table).all(axis=1)))]!r}")
     return table
 
 
-def _ns(t_s: F64) -> I64:
+def _ns(t_s: F64, path: Path) -> I64:
     """Seconds with microsecond digits -> ns; rounding to the digits written keeps equal times equal."""
+    if (beyond := np.abs(t_s) > _MAX_T_S).any():
+        raise RecordingError(f"{path}: a time of {t_s[int(np.argmax(beyond))]:g} s: are the times seconds?")
     t_ns: I64 = np.rint(t_s * 1e6).astype(np.int64) * 1000
     return t_ns
 
 
 def _read_all(path: Path, columns: int) -> F64:
-    lines = [line for line in path.read_text().splitlines() if line.strip() and not line.startswith("#")]
+    lines = list(_lines(path))
     if not lines:
         raise RecordingError(f"{path}: is empty")
     table = _table(lines, columns, path)
@@ -120,7 +137,7 @@ def _read_all(path: Path, columns: int) -> F64:
 def _read_imu(path: Path) -> Imu:
     """``t ax ay az gx gy gz`` in s, m/s^2, rad/s."""
     table = _read_all(path, 7)
-    return Imu(_ns(table[:, 0]), table[:, 1:4].copy(), table[:, 4:7].copy())
+    return Imu(_ns(table[:, 0], path), table[:, 1:4].copy(), table[:, 4:7].copy())
 
 
 def _read_truth(path: Path, T_cam_imu: F64) -> Truth:
@@ -135,4 +152,4 @@ def _read_truth(path: Path, T_cam_imu: F64) -> Truth:
     v_W = (p_WB[2:] - p_WB[:-2]) / (t_s[2:] - t_s[:-2])[:, None]
     omega_B = (R_WB[:-2].inv() * R_WB[2:]).as_rotvec() / (t_s[2:] - t_s[:-2])[:, None]
     inner = R_WB[1:-1]
-    return Truth(_ns(t_s[1:-1]), inner.inv().apply(v_W), omega_B, inner.as_quat(), p_WB[1:-1])
+    return Truth(_ns(t_s[1:-1], path), inner.inv().apply(v_W), omega_B, inner.as_quat(), p_WB[1:-1])
