@@ -189,6 +189,27 @@ def test_a_result_that_cannot_be_written_is_named(capsys: pytest.CaptureFixture[
     assert capsys.readouterr().err == "velod: error: nowhere/out.csv: No such file or directory\n"
 
 
+def test_a_result_that_cannot_be_written_is_named_before_the_work(capsys: pytest.CaptureFixture[str]) -> None:
+    # The recording, which is not there either, is not looked at.
+    for argv in (["replay", "absent.h5", "--csv"], ["eval", "absent.h5", "--json"], ["demo", "--csv"]):
+        assert error_of(capsys, *argv, "nowhere/out") == "nowhere/out: No such file or directory"
+        assert error_of(capsys, *argv, "/") == "/: Is a directory"
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no device that is always full")
+def test_a_full_disk_is_named_with_the_file(capsys: pytest.CaptureFixture[str], recording: Path) -> None:
+    assert main(["replay", str(recording), "--offline", "--csv", "/dev/full"]) == 2
+    captured = capsys.readouterr()
+    assert captured.err == "velod: error: /dev/full: No space left on device\n"
+    assert "median speed" in captured.out, "what was computed is not lost"
+
+
+def test_checking_settings_looks_at_their_endpoints(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    (tmp_path / "velod.toml").write_text('[zenoh]\nlisten = "tcp/localhost"\n')
+    error = error_of(capsys, "config", "check", str(tmp_path / "velod.toml"))
+    assert error.startswith(f"{tmp_path / 'velod.toml'}: zenoh.listen: must be an endpoint")
+
+
 def test_a_run_without_a_valid_velocity_fails_and_says_so(
     capsys: pytest.CaptureFixture[str], recording: Path, tmp_path: Path
 ) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -224,6 +225,14 @@ def test_a_damaged_block_is_not_taken_for_a_missing_filter(path: Path) -> None:
 def test_a_directory_in_the_place_of_the_file_is_said_before_anything_is_written(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="cannot be written: is a directory"):
         write_recording(tmp_path, sequence())
+
+
+def test_on_a_full_disk_nothing_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    free = iter([1 << 30, 1 << 23])  # enough for an empty file, none for events
+    monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=next(free)))
+    with pytest.raises(RecordingError, match=r"full\.h5: cannot be written: no space left"):
+        write_recording(tmp_path / "full.h5", sequence())
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_streams_on_different_clocks_are_refused(path: Path) -> None:

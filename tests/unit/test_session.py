@@ -50,3 +50,20 @@ def test_a_missing_or_broken_configuration_file_is_refused_by_name(tmp_path: Pat
     broken.write_text("{ mode: ")
     with pytest.raises(SessionError, match=r"broken\.json5: not a zenoh configuration"):
         open_session(ZenohSettings(config=str(broken)))
+
+
+def test_a_panic_of_zenoh_for_want_of_shared_memory_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    panic = type("PanicException", (BaseException,), {})
+
+    def fail(_: object) -> None:
+        raise panic(
+            "called `Result::unwrap()` on an `Err` value: Unable to create POSIX shm segment: OS error 12 at x"
+        )
+
+    monkeypatch.setattr(session.zenoh, "open", fail)
+    with pytest.raises(SessionError, match=r"no shared memory: .* zenoh\.shared_memory = false"):
+        open_session(ZenohSettings())
+
+
+def test_without_shared_memory_none_is_touched() -> None:
+    assert session.peer_tree([], [], shared_memory=False)["transport"]["shared_memory"]["mode"] == "lazy"

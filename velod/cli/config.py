@@ -49,7 +49,13 @@ def init(path: str, *, force: bool) -> int:
 
 def check(path: str) -> int:
     """Say whether velod would take a settings file, and the calibration that it names."""
-    named = calibration_of(config.load(path)) is not None
+    from velod.runtime.endpoints import parse
+
+    settings = config.load(path)
+    for name, endpoint in (("connect", settings.zenoh.connect), ("listen", settings.zenoh.listen)):
+        if endpoint:
+            parse(endpoint, f"{path}: zenoh.{name}")
+    named = calibration_of(settings) is not None
     print(f"{path}: good" + ("" if named else "; rig.calibration is empty, and `velod run` needs one"))
     return 0
 

@@ -11,7 +11,16 @@ from typing import TYPE_CHECKING, Self
 
 from velod.cli.config import calibration_of, settings_of
 from velod.cli.exit import RunFailed
-from velod.cli.report import Line, VelocityLine, log_above, progress_bar, with_progress, write_csv, write_json
+from velod.cli.report import (
+    Line,
+    VelocityLine,
+    log_above,
+    progress_bar,
+    require_writable,
+    with_progress,
+    write_csv,
+    write_json,
+)
 from velod.cli.watch import losses
 from velod.config import Settings
 from velod.io import Chunking, Recording, open_recording
@@ -57,10 +66,11 @@ class Played:
 
 def replay(config: str | None, file: str, options: PlayOptions, csv: str | None) -> int:
     """Play a recording and say what came out. Raises RunFailed if that is no valid velocity."""
+    require_writable(csv)
     played = play(settings_of(config, options.calibration), file, options)
+    print(summary(played, _metrics(played)))
     if csv is not None:
         write_csv(csv, played.velocities)
-    print(summary(played, _metrics(played)))
     if not has_velocity(played):
         raise RunFailed(f"{file}: no valid velocity")
     return 0
@@ -76,6 +86,7 @@ def evaluate_files(
     floor: bool = False,
 ) -> int:
     """Judge recordings against the truth that they hold. Raises RunFailed if one yields no valid velocity."""
+    require_writable(json)
     settings = settings_of(config, options.calibration)
     if settings.optimizer.frame != "imu":
         raise ValueError("optimizer.frame: must be 'imu' to be judged: the truth in recordings is the IMU's")
@@ -298,6 +309,7 @@ def demo(config: str | None, name: str, seconds: float, seed: int, csv: str | No
     """Simulated sensors through the service. Raises RunFailed where the result is not as it should be."""
     from velod.sim import simulated_recording
 
+    require_writable(csv, json)
     settings = settings_of(config, calibration="")  # the simulated rig brings its own
     with _Bar(f"simulating {seconds:g} s of {name}") as bar:
         path = simulated_recording(name, seconds, seed, bar.show)

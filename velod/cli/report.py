@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import csv
+import errno
 import json
 import logging
 import math
+import os
 import shutil
 import sys
 import time
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from threading import Lock
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 
@@ -32,9 +35,33 @@ _REDRAW_S = 0.1
 _UPPER = np.triu_indices(3)
 
 
+def require_writable(*paths: str | None) -> None:
+    """Raise OSError where a file cannot be made, before the work whose result it is to hold; None and ``-`` pass."""
+    for path in paths:
+        if path is None or path == "-":
+            continue
+        folder = Path(path).absolute().parent
+        if Path(path).is_dir():
+            raise OSError(errno.EISDIR, os.strerror(errno.EISDIR), path)
+        if not folder.is_dir():
+            raise OSError(errno.ENOENT, os.strerror(errno.ENOENT), path)
+        if not os.access(path if Path(path).exists() else folder, os.W_OK):
+            raise OSError(errno.EACCES, os.strerror(errno.EACCES), path)
+
+
+@contextmanager
+def _written(path: str) -> Iterator[TextIO]:
+    """A text file to write; what fails while it is written, such as a full disk, names it too. Raises OSError."""
+    try:
+        with Path(path).open("w", newline="", encoding="utf-8") as f:
+            yield f
+    except OSError as e:
+        raise OSError(e.errno, e.strerror, path) from None
+
+
 def write_csv(path: str, velocities: Sequence[Velocity]) -> None:
     """One line per velocity; numbers that read back exactly; what is not known is empty."""
-    with Path(path).open("w", newline="", encoding="utf-8") as f:
+    with _written(path) as f:
         writer = csv.writer(f)
         writer.writerow(CSV_COLUMNS)
         for v in velocities:
@@ -54,7 +81,8 @@ def write_json(path: str, value: Any) -> None:
     if path == "-":
         sys.stdout.write(text)
     else:
-        Path(path).write_text(text, encoding="utf-8")
+        with _written(path) as f:
+            f.write(text)
 
 
 class Line:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,8 @@ _MODELS = {"radtan": 5, "equi": 4}
 _EVENT_COLUMNS = {"x": np.uint16, "y": np.uint16, "t": np.int64, "p": np.uint8}
 _CHUNK = 1 << 17
 _IMU_CHUNK = 1 << 12
+_SPARE_BYTES = 1 << 23
+"""What HDF5 holds back until it closes. It cannot close on a full disk, so the disk must never be full."""
 # Level 1 with byte shuffle: 3 bytes an event instead of 13, read as fast; higher levels take long for little.
 _PACKED = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 
@@ -137,6 +140,8 @@ class RecordingWriter:
         self._finished = False
         if self._path.is_dir():
             raise RecordingError(f"{self._path}: cannot be written: is a directory")
+        if self._path.parent.is_dir():
+            self._require_space(0)
         try:
             self._file = h5py.File(self._part, "w")
         except OSError as e:
@@ -191,6 +196,7 @@ class RecordingWriter:
                 "gt", truth.t_ns, v_B=truth.v_B, omega_B=truth.omega_B, q_WB_xyzw=truth.q_WB_xyzw, **position
             )
         if depth is not None:
+            self._require_space(depth.left.nbytes)
             self._write_group("depth", depth.t_ns)
             self._file.create_dataset("depth/left", data=depth.left, **_PACKED)
         self._finished = True
@@ -211,9 +217,14 @@ class RecordingWriter:
         if not parts:
             return
         t_us = _microseconds(np.concatenate([part.t_ns for part in parts]), self._path)
+        self._require_space(len(t_us) * sum(np.dtype(kind).itemsize for kind in _EVENT_COLUMNS.values()))
         x, y, p = (np.concatenate([getattr(part, name) for part in parts]) for name in "xyp")
         for name, column in (("x", x), ("y", y), ("t", t_us), ("p", p)):
             _extend(self._file[f"events/{side}/{name}"], column)
+
+    def _require_space(self, n_bytes: int) -> None:
+        if shutil.disk_usage(self._path.absolute().parent).free < n_bytes + _SPARE_BYTES:
+            raise RecordingError(f"{self._path}: cannot be written: no space left on the disk")
 
     def _write_group(self, name: str, t_ns: I64, **columns: F64) -> None:
         group = self._file.create_group(name)

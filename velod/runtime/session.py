@@ -54,6 +54,11 @@ def open_config(config: zenoh.Config, settings: ZenohSettings, introducer: bool 
         session = zenoh.open(config)
     except zenoh.ZError as e:
         raise SessionError(_explain(str(e), settings, introducer)) from None
+    except BaseException as e:
+        # A panic of Zenoh's is no Exception, and its class cannot be imported.
+        if type(e).__name__ != "PanicException":
+            raise
+        raise SessionError(_explain(str(e), settings, introducer)) from None
     keep_from_blocking(session)
     return session
 
@@ -218,7 +223,8 @@ def _transport(shared_memory: bool, lossless: bool) -> dict[str, Any]:
         },
         "shared_memory": {
             "enabled": shared_memory,
-            "mode": "init",
+            # "init" takes a piece of /dev/shm even where it is not enabled, and panics where there is none.
+            "mode": "init" if shared_memory else "lazy",
             "transport_optimization": {
                 "enabled": shared_memory,
                 "pool_size": POOL_BYTES,
@@ -273,6 +279,11 @@ def _explain(error: str, settings: ZenohSettings, introducer: bool) -> str:
         return (
             f"port {listener[2]} is already in use: another velod may be running here;"
             f" stop it, or choose another zenoh.port (wanted {listener[1].rstrip(':')})"
+        )
+    if "shm segment" in error:
+        return (
+            "no shared memory: /dev/shm is full, read-only or missing; make room there (docker: --shm-size),"
+            " or set zenoh.shared_memory = false"
         )
     endpoint = f"tcp/127.0.0.1:{settings.port}" if introducer else introducer_endpoint(settings)
     cause = _first_line(error)
