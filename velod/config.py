@@ -208,7 +208,7 @@ class OptimizerSettings:
     )
     fixed_sigma_px_s: float = _f(20.0, "sigma of a flow residual with weights = 'fixed', px/s", above=0.0, hi=1e4)
     shared_error: float = _f(
-        6.0, "information of a batch is divided by this for errors its flows share", lo=1.0, hi=100.0
+        5.0, "information of a batch is divided by this for errors its flows share", lo=1.0, hi=100.0
     )
     shared_gyro_noise: bool = _f(
         True,

@@ -8,9 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from velod.config import Settings
+from velod.events.sensor_size import for_sensor
 from velod.geometry.calibration import Calibration
 from velod.geometry.rectify import rectify
-from velod.optimizer import attitude, degeneracy, flow_equation, inertial_residual
+from velod.optimizer import attitude, degeneracy, flow_equation, inertial_residual, overlap
 from velod.optimizer.attitude import Attitude
 from velod.optimizer.consistency import Consistency
 from velod.optimizer.equations import EquationMaker, Equations, Prediction
@@ -85,7 +86,8 @@ class Estimator:
         """``rotation_check``: that of the estimator before, of the same rig."""
         o = settings.optimizer
         rect = rectify(calibration)
-        self._o, self._imu = o, settings.imu
+        ingest = for_sensor(settings, calibration.left.width, calibration.left.height).ingest
+        self._o, self._imu, self._ingest = o, settings.imu, ingest
         self.camera = (rect.f, rect.cx, rect.cy)
         self._maker = EquationMaker(self.camera, rect.R_CB, rect.p_BC_B)
         self._knot_ns = int(o.knot_s * NS_PER_S)
@@ -374,6 +376,9 @@ class Estimator:
         if shared > self._o.shared_error:
             self._count("fit.inconsistent")
         on_spline = equations.on_error if self._o.spline == "error" else equations.on_velocity
+        if self._o.weights == "propagated":
+            times = overlap.times_seen(equations.measured.speed, self._ingest)
+            on_spline = overlap.counted_once(on_spline, times)
         bins = flow_equation.compress(on_spline, equations.common, fit, shared, self._slope())
         if not len(weak_L) and predicted is not None and self.head is not None:
             R_LB = self.memory.at(np.array([t_ns]))[0][0]
