@@ -36,7 +36,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--rays", type=int, default=1, metavar="K",
         help="a pixel's light is the mean over K x K rays, not one at its centre (1 to 4, default 1): outlines then "
-        "cross it gradually, as on a real sensor; K = 2 takes three times as long",
+        "cross it gradually, as on a real sensor; K = 2 takes two to five times as long",
     )  # fmt: skip
     parser.add_argument("--texture", type=int, metavar="SEED", help="other leaves on walls and boxes")
     parser.add_argument("--threshold", type=float, metavar="C", help="contrast at which pixels fire (default 0.5)")
