@@ -281,6 +281,17 @@ def test_simulated_files_are_recordings(tmp_path: Path) -> None:
 # --- settings ---
 
 
+def test_a_simulation_that_is_told_to_end_leaves_no_file(tmp_path: Path) -> None:
+    command = [sys.executable, "-P", "-m", "velod.cli", "sim", "corridor-1", "-o", str(tmp_path / "a.h5")]
+    with subprocess.Popen([*command, "--seconds", "60"], stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        assert process.stderr.readline() == "simulating 60 s of corridor-1\n"
+        assert list(tmp_path.iterdir()), "it is at work"
+        process.terminate()
+        assert process.wait(30) == 130
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_written_settings_are_the_defaults_and_are_not_overwritten(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:

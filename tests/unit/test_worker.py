@@ -6,15 +6,18 @@ import os
 import sys
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
+from velod.cli import main
 from velod.config import FlowSettings, Settings, ZenohSettings
 from velod.runtime import worker
+from velod.runtime.kernel_cache import ensure_cache_directory, own_directory
 from velod.runtime.process import ChildProcess, stop_all
 from velod.runtime.stages import create_stage, stage_of, worker_names
 from velod.runtime.supervisor import Supervisor, restart_delay_s
-from velod.runtime.warmup import ensure_cache_directory, plain_calibration
+from velod.runtime.warmup import plain_calibration
 
 
 def test_a_name_tells_the_stage() -> None:
@@ -109,3 +112,22 @@ def test_kernels_are_cached_elsewhere_only_where_nothing_else_can_be_written(mon
     monkeypatch.delenv("NUMBA_CACHE_DIR")
     ensure_cache_directory()
     assert os.environ["NUMBA_CACHE_DIR"].endswith(f"velod-numba-{os.getuid()}")
+
+
+def test_every_command_finds_a_place_for_compiled_kernels_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "to be restored")
+    monkeypatch.delenv("NUMBA_CACHE_DIR")
+    monkeypatch.setattr(os, "access", lambda *_: False)  # an installation and a home that are read-only
+    assert main(["config", "show"]) == 0
+    assert Path(os.environ["NUMBA_CACHE_DIR"]).stat().st_mode & 0o077 == 0
+
+
+def test_kernels_that_others_could_have_put_there_are_not_taken(tmp_path: Path) -> None:
+    own = own_directory(tmp_path)
+    assert own_directory(tmp_path) == own
+    own.chmod(0o777)
+    assert own_directory(tmp_path) != own
+    own.rmdir()
+    (tmp_path / "elsewhere").mkdir()
+    own.symlink_to(tmp_path / "elsewhere")
+    assert own_directory(tmp_path) != own

@@ -10,12 +10,14 @@ from velod import __version__
 from velod.cli import play_commands, proof_commands, service_commands, watch_commands
 from velod.cli.exit import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE, RunFailed
 from velod.cli.options import plain
+from velod.runtime.kernel_cache import ensure_cache_directory
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; the exit code. What a user can put right is one line on stderr, never a traceback."""
     args = _parser().parse_args(argv)
     command: Callable[[argparse.Namespace], int] = args.command
+    ensure_cache_directory()
     try:
         return command(args)
     except KeyboardInterrupt:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import signal
 import sys
 import time
 from dataclasses import dataclass, field, replace
@@ -299,6 +300,7 @@ def simulate_to_file(recipe: Sequence, path: str, seconds: float, seed: int) -> 
     """Record a simulated sequence. Raises RecordingError."""
     from velod.sim import simulate
 
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C: half a file is not left behind
     with _Bar(f"simulating {seconds:g} s of {recipe.name}") as bar:
         simulate(recipe, seconds, seed, path, bar.show)
     print(f"wrote {path}")

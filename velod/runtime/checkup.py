@@ -20,9 +20,9 @@ from velod.events.sensor_size import max_disparity_px
 from velod.geometry.calibration import Calibration, CalibrationError, Camera, load_calibration
 from velod.runtime.access import ROLES, SERVER
 from velod.runtime.endpoints import SessionError
+from velod.runtime.kernel_cache import ensure_cache_directory
 from velod.runtime.session import open_session
 from velod.runtime.settings_service import fetch
-from velod.runtime.warmup import ensure_cache_directory
 
 State = Literal["OK", "WARN", "FAIL"]
 

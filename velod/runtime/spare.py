@@ -19,6 +19,7 @@ from contextlib import suppress
 from threading import Event
 from typing import TYPE_CHECKING, TypeVar
 
+from velod.runtime.kernel_cache import ensure_cache_directory
 from velod.runtime.parent import die_with
 
 if TYPE_CHECKING:
@@ -92,10 +93,10 @@ def quietly(work: Callable[[], T]) -> T:
 
 
 def _import_all() -> None:
-    from velod.runtime import stages, warmup, worker
+    from velod.runtime import stages, worker
 
     worker.start_logging("spare")
-    warmup.ensure_cache_directory()
+    ensure_cache_directory()
     stages.import_all()
 
 

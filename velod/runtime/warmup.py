@@ -5,17 +5,14 @@ The input is one picture: slanted edges that move to the right at one depth, in 
 
 from __future__ import annotations
 
-import os
-import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
-from importlib.util import find_spec
-from pathlib import Path
 
 import numpy as np
 
 from velod.config import Settings
 from velod.geometry.calibration import Calibration, Camera
+from velod.runtime.kernel_cache import ensure_cache_directory
 from velod.runtime.stages import STAGES, create_stage
 from velod.types import (
     F64,
@@ -39,18 +36,6 @@ _BATCH_NS = 20_000_000
 _IMU_NS = 5_000_000
 _SECONDS = 1.3  # longer than the window, so that its oldest segment leaves it
 _SPECIFIC_FORCE = (0.0, -9.81, 0.0)  # at rest, y down
-
-
-def ensure_cache_directory() -> None:
-    """Set NUMBA_CACHE_DIR where numba would find no place of its own to write to. Call before numba is imported."""
-    if "NUMBA_CACHE_DIR" in os.environ:
-        return
-    spec = find_spec("velod")
-    package = Path(spec.origin).parent if spec is not None and spec.origin else Path()
-    if not (os.access(package, os.W_OK) or os.access(Path.home(), os.W_OK)):
-        directory = Path(tempfile.gettempdir()) / f"velod-numba-{os.getuid()}"
-        directory.mkdir(mode=0o700, exist_ok=True)
-        os.environ["NUMBA_CACHE_DIR"] = str(directory)
 
 
 def fill_cache(settings: Settings, calibration: Calibration | None = None) -> None:

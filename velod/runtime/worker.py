@@ -17,6 +17,7 @@ import zenoh
 from velod.config import Settings, ZenohSettings
 from velod.runtime import warmup
 from velod.runtime.access import ROLES
+from velod.runtime.kernel_cache import ensure_cache_directory
 from velod.runtime.parent import die_with
 from velod.runtime.roles import SHELLS
 from velod.runtime.session import introducer_endpoint, open_session
@@ -130,7 +131,7 @@ def prepare_process(parent: int) -> None:
     die_with(parent)
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
     keep_memory()
-    warmup.ensure_cache_directory()
+    ensure_cache_directory()
 
 
 def keep_memory() -> None:
