@@ -75,6 +75,7 @@ def test_settings_that_velod_would_not_take_are_one_line(tmp_path: Path, capsys:
     ("changes", "doubt"),
     [
         ({"t_RL": np.array([-100.0, 0.0, 0.0])}, "a baseline of 100 m"),
+        ({"T_cam_imu": np.array([[1.0, 0, 0, 60], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])}, "an IMU 60 m from"),
         ({"left": replace(plain_calibration().left, cx=20.0)}, "left: principal point"),
         ({"left": replace(plain_calibration().left, fx=3000.0, fy=3000.0)}, "left: a focal length of 3000 px"),
     ],

@@ -207,6 +207,8 @@ def _doubts(rig: Calibration) -> list[str]:
     low_m, high_m = BASELINES_M
     baseline_m = _baseline_m(rig)
     doubts = [] if low_m <= baseline_m <= high_m else [f"a baseline of {baseline_m:g} m"]
+    if (arm_m := math.hypot(*rig.T_cam_imu[:3, 3])) > high_m:
+        doubts.append(f"an IMU {arm_m:g} m from the camera")
     for side, camera in (("left", rig.left), ("right", rig.right)):
         doubts += [f"{side}: {doubt}" for doubt in _camera_doubts(camera)]
     return doubts
