@@ -127,6 +127,20 @@ def test_a_missing_dataset_is_named(path: Path, name: str) -> None:
         open_recording(path)
 
 
+def test_off_may_be_written_as_minus_one(path: Path, tmp_path: Path) -> None:
+    with h5py.File(path, "a") as file:
+        p = file["events/left/p"][:].astype(np.int8)
+        del file["events/left/p"]
+        file["events/left/p"] = np.where(p == 0, -1, p)
+    for side in ("left", "right"):
+        write_text(tmp_path / side, 1)
+        (text := tmp_path / side / "events.txt").write_text(text.read_text().replace(" 0\n", " -1\n"))
+    for recording in (open_recording(path), open_recording(tmp_path, calibration=calibration())):
+        read = np.concatenate([block.p for block in recording.left.blocks()])
+        assert np.array_equal(read, events(1).p)
+        assert set(read) == {0, 1}
+
+
 def test_columns_of_different_length_are_refused(path: Path) -> None:
     with h5py.File(path, "a") as file:
         del file["events/left/p"]

@@ -13,7 +13,7 @@ import numpy as np
 
 from velod.geometry.calibration import CalibrationError
 from velod.io.model import EventColumns, Imu, RecordingError
-from velod.types import I64
+from velod.types import I64, U8
 
 BLOCK = 1 << 18
 """Events read at a time."""
@@ -136,8 +136,13 @@ class Hdf5Events:
                     (t[part].astype(np.int64) + self.offset_us) * 1000,
                     pixels(x[part], f"{self.name}/x"),
                     pixels(y[part], f"{self.name}/y"),
-                    p[part].astype(np.uint8),
+                    polarities(p[part]),
                 )
+
+
+def polarities(values: Any) -> U8:
+    """Polarities as u8, 1 = ON, 0 = OFF; some tools write OFF as -1. What else there is, ingest counts and drops."""
+    return np.where(values == -1, 0, values).astype(np.uint8)
 
 
 def pixels(values: Any, name: str) -> Any:

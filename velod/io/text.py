@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from velod.geometry.calibration import Calibration, CalibrationError, load_calibration
-from velod.io.hdf5 import pixels
+from velod.io.hdf5 import pixels, polarities
 from velod.io.model import EventColumns, Imu, Parts, RecordingError, Truth
 from velod.types import F64, I64
 
@@ -88,7 +88,7 @@ class TextEvents:
                 _ns(table[:, 0], self.path),
                 pixels(table[:, 1], self.name),
                 pixels(table[:, 2], self.name),
-                table[:, 3].astype(np.int64).astype(np.uint8),
+                polarities(table[:, 3].astype(np.int64)),
             )
 
 
