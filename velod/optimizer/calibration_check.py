@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from velod.config import OptimizerSettings
+from velod.optimizer.depth_share import DepthShare
 from velod.optimizer.rotation_check import Offsets
 from velod.optimizer.scale_check import ScaleCheck
 from velod.optimizer.stereo_check import StereoCheck
@@ -16,6 +17,7 @@ SURE = 3.0
 """An alarm is raised when a value is beyond its limit by this many sigmas."""
 
 CLOCK, ROWS, SCALE = "calibration.clock", "calibration.rows", "calibration.scale"
+MATCHES = "calibration.matches"
 IMU_CLOCK, IMU_ROTATION = "calibration.imu_clock", "calibration.imu_rotation"
 
 
@@ -33,12 +35,17 @@ class CalibrationCheck:
             IMU_CLOCK: settings.alarm_imu_clock_ms,
             IMU_ROTATION: settings.alarm_imu_rotation_deg,
         }
-        self._stereo, self._scale = StereoCheck(camera), ScaleCheck()
+        self._stereo, self._scale, self._depths = StereoCheck(camera), ScaleCheck(), DepthShare()
         self._offsets: Offsets | None = None
         self._turn = 0
 
     def add_batch(self, flow: FlowBatch, depth: DepthBatch) -> None:
         """Flow and depth of one batch."""
+        self._depths.add(depth)
+        self.gauges[f"{MATCHES}_percent"] = 100.0 * self._depths.mean
+        self.alarms.pop(MATCHES, None)
+        if self._depths.alarm:
+            self.alarms[MATCHES] = self._depths.alarm
         self._turn += 1
         if self._turn % EVERY:
             return

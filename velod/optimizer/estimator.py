@@ -14,6 +14,7 @@ from velod.geometry.rectify import rectify
 from velod.optimizer import attitude, degeneracy, flow_equation, inertial_residual, overlap
 from velod.optimizer.attitude import Attitude
 from velod.optimizer.consistency import Consistency
+from velod.optimizer.depth_share import cameras_disagree
 from velod.optimizer.equations import EquationMaker, Equations, Prediction
 from velod.optimizer.flow_equation import BIN_NS, COMMON, RIDGE, Bins, Fit, Rows
 from velod.optimizer.frame import Rate
@@ -279,6 +280,10 @@ class Estimator:
 
     def _equations(self, flow: FlowBatch, depth: DepthBatch) -> Equations | None:
         """Of the events of which both flow and depth speak; None where they are too few."""
+        if cameras_disagree(depth):
+            self._count("fit.few_depths")
+            self.lacking = _lack(flow, depth)
+            return None
         earliest_ns = int(self.memory.t_ns[0])
         if not self.window.empty:
             earliest_ns = max(earliest_ns, self.window.first * self._knot_ns)

@@ -332,7 +332,8 @@ class OptimizerStage:
         if not self._was_valid:
             state = TrackingState.LOST if self._was_lost else TrackingState.INITIALISING
             if self._estimator.batches < MIN_BATCHES:
-                return state, f"{self._estimator.batches} usable batches", False
+                why = "" if self._estimator.batches else f"; the newest: {self._estimator.lacking}"
+                return state, f"{self._estimator.batches} usable batches{why}", False
             seen_ns = tau - self._estimator.first_usable_t_ns
             # nothing may speak against IMU or calibration: what is uncertain for that is wrong
             late = seen_ns >= LATE_NS and not self._was_lost and self._estimator.biases_as_specified
