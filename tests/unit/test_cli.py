@@ -184,6 +184,15 @@ def test_a_value_that_cannot_be_is_refused_at_once(
     assert cause in refused_by_parser(capsys, *argv)
 
 
+def test_what_speaks_against_the_sensors_stands_below_the_summary(
+    capsys: pytest.CaptureFixture[str], recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("velod.ingest.imu_units.LEAST_M_S2", 1000.0)
+    monkeypatch.setattr("velod.ingest.imu_units.PERIOD_NS", 100_000_000)
+    assert main(["replay", str(recording), "--offline"]) == 0
+    assert "ALARM          imu.units: the accelerometer reads" in capsys.readouterr().out
+
+
 def test_a_result_that_cannot_be_written_is_named(capsys: pytest.CaptureFixture[str], recording: Path) -> None:
     assert main(["replay", str(recording), "--offline", "--csv", "nowhere/out.csv"]) == 2
     assert capsys.readouterr().err == "velod: error: nowhere/out.csv: No such file or directory\n"
@@ -218,7 +227,9 @@ def test_a_run_without_a_valid_velocity_fails_and_says_so(
     out = tmp_path / "out.json"
     argv = ["eval", str(recording), "--offline", "-c", str(settings), "--json", str(out)]
     assert main(argv) == 1
-    assert capsys.readouterr().err == f"velod: failed: {recording}: no valid velocity\n"
+    why = "initialising: 0 usable batches; the newest: "
+    said = capsys.readouterr().err
+    assert said.startswith(f"velod: failed: {recording}: no valid velocity ({why}") and said.count("\n") == 1
     assert json.loads(out.read_text())["ave_mps"] is None
 
 

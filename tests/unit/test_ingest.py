@@ -350,6 +350,28 @@ def test_a_frozen_imu_is_dropped_with_an_alarm_until_it_moves() -> None:
     assert ingest.alarms == {}
 
 
+@pytest.mark.parametrize(
+    ("accel", "gyro", "doubt"),
+    [
+        (9.81, 0.2, ""),
+        (3.0, 30.0, ""),  # braking hard upwards, spinning at the end of the range
+        (1.0, 0.2, "1.00 m/s^2 over a second: is it in g?"),
+        (9.81, 75.0, "75 rad/s over a second: is it in degrees?"),
+    ],
+)
+def test_an_imu_in_other_units_is_doubted_within_two_seconds(accel: float, gyro: float, doubt: str) -> None:
+    ingest, rng = stage(), np.random.default_rng(1)
+    for i in range(400):
+        value = 1e-3 * rng.normal(size=(1, 3))
+        sample = imu_packet(
+            i, [T0_NS + i * 5 * MS], value + np.array([0.0, 0.0, accel]), value + np.array([gyro, 0.0, 0.0])
+        )
+        ingest.handle(sample)
+        assert i > 150 or not ingest.alarms, "a moment says nothing"
+    assert doubt in ingest.alarms.get("imu.units", "")
+    assert bool(ingest.alarms) == bool(doubt)
+
+
 def test_every_batch_ends_after_all_that_was_promised_before_it() -> None:
     ingest, e = stage(), edges(seconds=0.1)
     promised, imu_seq, sent = 0, 0, 0

@@ -33,6 +33,9 @@ if TYPE_CHECKING:
     from velod.sim import Sequence
 
 
+_SENSORS = ("calibration", "camera", "imu")  # first parts of the names of alarms
+
+
 @dataclass(frozen=True, slots=True)
 class PlayOptions:
     """How a recording is played."""
@@ -54,6 +57,15 @@ class Played:
     latency_p50_ms: float | None = None  # batch closed to velocity out; None offline
     latency_p99_ms: float | None = None
     counters: dict[str, dict[str, int]] = field(default_factory=dict)  # by worker
+    alarms: dict[str, str] = field(default_factory=dict)  # of sensors and calibration, at the end
+
+    @property
+    def why_not(self) -> str:
+        """What kept the last velocity from being valid."""
+        if not self.velocities:
+            return "no velocity at all"
+        last = self.velocities[-1]
+        return f"{last.state}: {last.reason}"
 
     @property
     def rate_hz(self) -> float:
@@ -73,7 +85,7 @@ def replay(config: str | None, file: str, options: PlayOptions, csv: str | None)
     if csv is not None:
         write_csv(csv, played.velocities)
     if not has_velocity(played):
-        raise RunFailed(f"{file}: no valid velocity")
+        raise RunFailed(f"{file}: no valid velocity ({played.why_not})")
     return 0
 
 
@@ -102,13 +114,13 @@ def evaluate_files(
         print(summary(played, metrics, floor_mps), file=sys.stderr if json == "-" else sys.stdout)
         rows.append(result_row(played, metrics, floor_mps))
         if not has_velocity(played):
-            failed.append(file)
+            failed.append(f"{file}: no valid velocity ({played.why_not})")
         elif plot is not None:
             _plot(played, plot)
     if json is not None:
         write_json(json, rows if len(rows) > 1 else rows[0])
     if failed:
-        raise RunFailed(f"{', '.join(failed)}: no valid velocity")
+        raise RunFailed("; ".join(failed))
     return 0
 
 
@@ -133,9 +145,10 @@ def _play_offline(settings: Settings, recording: Recording, chunking: Chunking) 
     counters: dict[str, dict[str, int]] = {}
     start_s = time.monotonic()
     packets = with_progress(recording.packets(chunking), recording.t_start_ns, recording.t_end_ns)
-    velocities = run_offline(settings, recording.calibration, packets, counters=counters)
+    alarms: dict[str, str] = {}
+    velocities = run_offline(settings, recording.calibration, packets, counters=counters, alarms=alarms)
     factor = recording.duration_s / (time.monotonic() - start_s)
-    return Played(recording, velocities, factor, offline=True, counters=counters)
+    return Played(recording, velocities, factor, offline=True, counters=counters, alarms=alarms)
 
 
 def _play_online(settings: Settings, recording: Recording, options: PlayOptions) -> Played:
@@ -178,6 +191,12 @@ def _play_online(settings: Settings, recording: Recording, options: PlayOptions)
         latency_p50_ms=p50_ms,
         latency_p99_ms=p99_ms,
         counters={worker: health.counters for worker, health in result.health.items()},
+        alarms={
+            name: text
+            for health in result.health.values()
+            for name, text in health.alarms.items()
+            if name.split(".")[0] in _SENSORS  # others speak of the run's end: streams fell silent
+        },
     )
 
 
@@ -248,6 +267,7 @@ def summary(played: Played, metrics: Metrics | None, floor_mps: float | None = N
         )
     lost = _losses(played.counters)
     lines += [f"dropped        {worker}: {text}" for worker, text in lost] or ["dropped        nothing"]
+    lines += [f"ALARM          {name}: {text}" for name, text in sorted(played.alarms.items())]
     return "\n".join(lines)
 
 

@@ -8,10 +8,11 @@ import numpy as np
 
 from velod.config import IngestSettings
 from velod.events.sae import NEVER
+from velod.ingest.imu_units import ImuUnits
 from velod.ingest.ordering import PacketOrder
 from velod.types import F64, I64, NS_PER_S, ImuPacket
 
-FROZEN = "imu.frozen"
+FROZEN, UNITS = "imu.frozen", "imu.units"
 
 
 class ImuStream:
@@ -27,6 +28,7 @@ class ImuStream:
         self._max_frozen = settings.imu_frozen_samples
         self._identical = 1
         self._last_value = np.full(6, np.nan)
+        self._units = ImuUnits()
         self._counters = counters
         self._alarms = alarms
 
@@ -43,10 +45,18 @@ class ImuStream:
         value = np.hstack([packet.accel, packet.gyro])
         finite = np.isfinite(value.sum(axis=1))
         kept = [i for i in range(len(value)) if self._is_good(int(packet.sample_t_ns[i]), value[i], bool(finite[i]))]
-        t_ns = packet.sample_t_ns[kept] - self._offset_ns
+        t_ns, accel, gyro = packet.sample_t_ns[kept] - self._offset_ns, packet.accel[kept], packet.gyro[kept]
         if kept:
             self.t_ns = int(t_ns[-1])
-        return t_ns, packet.accel[kept], packet.gyro[kept]
+        self._doubt_units(t_ns, accel, gyro)
+        return t_ns, accel, gyro
+
+    def _doubt_units(self, t_ns: I64, accel: F64, gyro: F64) -> None:
+        self._units.add(t_ns, accel, gyro)
+        if self._units.alarm:
+            self._alarms[UNITS] = self._units.alarm
+        else:
+            self._alarms.pop(UNITS, None)
 
     def _is_good(self, t_ns: int, value: F64, finite: bool) -> bool:
         if not finite:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 
 from velod.config import Settings
 from velod.geometry.calibration import Calibration
-from velod.runtime.stages import STAGES, Stage, create_stage
+from velod.runtime.stages import STAGES, Stage, alarms_of, create_stage
 from velod.types import EventBatch, EventPacket, ImuPacket, Message, StereoBatch, Velocity
 
 
@@ -16,11 +16,12 @@ def run_offline(
     packets: Iterable[EventPacket | ImuPacket],
     on_message: Callable[[Message], None] | None = None,
     counters: dict[str, dict[str, int]] | None = None,
+    alarms: dict[str, str] | None = None,
 ) -> list[Velocity]:
     """Every velocity that the packets lead to, in order.
 
     ``on_message`` is called with each message that a stage puts out, before the next stage sees it. ``counters``
-    is filled with the counters of each stage by name.
+    is filled with the counters of each stage by name, ``alarms`` with those that stand at the end.
     """
     stages = {name: create_stage(name, settings, calibration) for name in STAGES}
     velocities: list[Velocity] = []
@@ -31,6 +32,9 @@ def run_offline(
                 velocities.append(velocity)
     if counters is not None:
         counters.update({name: dict(stage.counters) for name, stage in stages.items()})
+    if alarms is not None:
+        for stage in stages.values():
+            alarms.update(alarms_of(stage))
     return velocities
 
 
