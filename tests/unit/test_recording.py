@@ -222,8 +222,16 @@ def test_imu_times_in_seconds_are_refused(path: Path) -> None:
         t_s = file["imu/t_us"][:] * 1e-6
         del file["imu/t_us"]
         file["imu/t_us"] = t_s
-    with pytest.raises(RecordingError, match="imu/t_us holds fractions, expected whole microseconds"):
+    with pytest.raises(RecordingError, match=r"imu/t_us spans 0\.1 us with 21 times: are they seconds"):
         open_recording(path)
+
+
+def test_fractions_of_a_microsecond_are_kept(path: Path) -> None:
+    with h5py.File(path, "r+") as file:
+        t_us = file["imu/t_us"][:] + 0.25
+        del file["imu/t_us"]
+        file["imu/t_us"] = t_us
+    assert np.array_equal(open_recording(path).imu.t_ns, sequence().imu.t_ns + 250)
 
 
 def test_a_damaged_block_is_not_taken_for_a_missing_filter(path: Path) -> None:
