@@ -17,7 +17,7 @@ from velod.types import I64, U8
 
 BLOCK = 1 << 18
 """Events read at a time."""
-_SHORTEST_STEP_NS = 10_000
+_SHORTEST_STEP_US = 10.0
 """No IMU is faster than 100 kHz on average."""
 
 # What h5py raises over a damaged file, and numpy over what it read from one.
@@ -82,13 +82,16 @@ def same_length(path: Path, group: str, columns: dict[str, Any]) -> int:
 def increasing_ns(t_us: Any, path: Path, name: str) -> I64:
     """File microseconds, whole or with fractions -> ns; they must increase, and be microseconds."""
     t_us = np.asarray(t_us)
-    if t_us.dtype.kind == "f" and not np.isfinite(t_us).all():
+    if t_us.dtype.kind != "f":
+        t_ns: I64 = t_us.astype(np.int64) * 1000
+    elif not np.isfinite(t_us).all():
         raise RecordingError(f"{path}: /{name} holds times that are not finite")
-    t_ns: I64 = np.rint(t_us * 1000.0).astype(np.int64) if t_us.dtype.kind == "f" else t_us.astype(np.int64) * 1000
-    if len(t_ns) > 1 and 0 <= t_ns[-1] - t_ns[0] < _SHORTEST_STEP_NS * (len(t_ns) - 1):
+    elif len(t_us) > 1 and 0.0 <= t_us[-1] - t_us[0] < _SHORTEST_STEP_US * (len(t_us) - 1):
         raise RecordingError(
-            f"{path}: /{name} spans {(t_ns[-1] - t_ns[0]) * 1e-3:g} us with {len(t_ns)} times: are they seconds?"
+            f"{path}: /{name} spans {t_us[-1] - t_us[0]:g} us with {len(t_us)} times: are they seconds?"
         )
+    else:
+        t_ns = np.rint(t_us * 1000.0).astype(np.int64)
     step = np.diff(t_ns)
     if len(step) and step.min() <= 0:
         i = int(np.argmax(step <= 0)) + 1
