@@ -18,10 +18,10 @@ class ImuUnits:
 
     def __init__(self) -> None:
         self.alarm = ""
-        self._begin(0)
+        self._begin()
 
-    def _begin(self, t_ns: int) -> None:
-        self._since_ns, self._n, self._accel, self._gyro = t_ns, 0, 0.0, 0.0
+    def _begin(self) -> None:
+        self._since_ns, self._n, self._accel, self._gyro = 0, 0, 0.0, 0.0
 
     def add(self, t_ns: I64, accel: F64, gyro: F64) -> None:
         """Good samples: times (n,), m/s^2 (n, 3), rad/s (n, 3)."""
@@ -34,7 +34,7 @@ class ImuUnits:
         self._gyro += float(np.linalg.norm(gyro, axis=1).sum())
         if int(t_ns[-1]) - self._since_ns >= PERIOD_NS:
             self.alarm = _doubt(self._accel / self._n, self._gyro / self._n)
-            self._begin(int(t_ns[-1]))
+            self._begin()
 
 
 def _doubt(accel: float, gyro: float) -> str:

@@ -44,8 +44,8 @@ class CalibrationCheck:
         self._depths.add(depth)
         self.gauges[f"{MATCHES}_percent"] = 100.0 * self._depths.mean
         self.alarms.pop(MATCHES, None)
-        if self._depths.alarm:
-            self.alarms[MATCHES] = self._depths.alarm
+        if alarm := self._depths.alarm:
+            self.alarms[MATCHES] = alarm
         self._turn += 1
         if self._turn % EVERY:
             return
