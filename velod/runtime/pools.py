@@ -67,12 +67,11 @@ class PoolKeeper:
     """Gives back the pools whose owners are gone. Call ``look`` about once a second."""
 
     def __init__(self) -> None:
-        self.emptied = 0
         self._seen_locked_s: dict[int, float] = {}  # by the file's number: when its owner was last alive
 
     def look(self, now_s: float) -> int:
         """Empty the pools whose owners have been gone for GRACE_S at ``now_s`` (monotonic); returns how many."""
-        before, seen = self.emptied, {}
+        emptied, seen = 0, {}
         for file, number in _open_pools():
             try:
                 if _is_locked(file):
@@ -82,11 +81,11 @@ class PoolKeeper:
                         seen[number] = self._seen_locked_s[number]
                     else:
                         _empty(file, number)
-                        self.emptied += 1
+                        emptied += 1
             finally:
                 os.close(file)
         self._seen_locked_s = seen
-        return self.emptied - before
+        return emptied
 
 
 def _open_pools(since_ns: int = 0) -> Iterator[tuple[int, int]]:
