@@ -17,7 +17,7 @@ from tests.moving_edges import (
     settings,
 )
 from velod.ingest.stage import IngestStage
-from velod.types import EventBatch, EventPacket, ImuSamples, StereoBatch
+from velod.types import NS_PER_S, EventBatch, EventPacket, ImuSamples, StereoBatch
 
 MS = 1_000_000
 
@@ -387,3 +387,15 @@ def test_every_batch_ends_after_all_that_was_promised_before_it() -> None:
             promised, imu_seq = now.event_t_ns, imu_seq + 1
     assert sent > T0_NS + 80 * MS
     assert promised > sent
+
+
+def test_events_that_pass_an_output_are_told_of_at_once() -> None:
+    """So that the optimizer knows without waiting for the next samples that no batch ended before its output."""
+    ingest, output_ns = stage(period_ms=20.0), 76 * NS_PER_S // 75
+    both(ingest, events([T0_NS + MS]), T0_NS + 2 * MS, seq=0)
+    ingest.handle(imu_packet(0, [T0_NS + 2 * MS]))
+    assert both(ingest, events([T0_NS + 3 * MS]), output_ns - MS, seq=1) == []
+    (word,) = both(ingest, events([output_ns]), output_ns + MS, seq=2)
+    assert isinstance(word, ImuSamples)
+    assert (word.event_t_ns, len(word.sample_t_ns)) == (output_ns + MS, 0)
+    assert both(ingest, events([output_ns + MS]), output_ns + 2 * MS, seq=3) == [], "told once"

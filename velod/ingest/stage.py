@@ -24,7 +24,20 @@ from velod.ingest.imu import ImuStream
 from velod.ingest.ordering import ClockRestart
 from velod.ingest.slices import Slices
 from velod.ingest.stream import CameraStream
-from velod.types import F64, I64, RING, U8, U16, U32, EventBatch, EventPacket, ImuPacket, ImuSamples, StereoBatch
+from velod.types import (
+    F64,
+    I64,
+    NS_PER_S,
+    RING,
+    U8,
+    U16,
+    U32,
+    EventBatch,
+    EventPacket,
+    ImuPacket,
+    ImuSamples,
+    StereoBatch,
+)
 
 Output = EventBatch | StereoBatch | ImuSamples
 
@@ -49,6 +62,7 @@ class IngestStage:
         self._batch_seq = -1
         self._imu_seq = -1
         self._turn = 0.0  # a batch is made when it reaches 1
+        self._output_hz = settings.optimizer.output_hz
         cal = calibration
         by_event = settings.ingest.mode == "event"
         self._slices = Slices(settings, cal.left.width, cal.left.height) if by_event else None
@@ -65,6 +79,7 @@ class IngestStage:
         # The paper's rules know nothing of it.
         self._time_noise = TimeNoise(self._settings.flow) if s.selection == "burst" else None
         self._batch_t_ns = 0
+        self._told_ns = 0  # how far the events had come by the newest word
         if self._slices is not None:
             # Parts of a batch that will never be whole must not join another one.
             self._batch_seq += self._slices.has_sent
@@ -74,6 +89,7 @@ class IngestStage:
     def handle(self, message: EventPacket | ImuPacket) -> list[Output]:
         """Batches that the message closes (each as StereoBatch, EventBatch, ImuSamples), or its IMU samples.
 
+        Where the optimizer may wait to hear that no batch ended before an output, ImuSamples without a sample say so.
         Event by event, the EventBatches are slices, and go out before the StereoBatch of the same events.
         """
         if isinstance(message, ImuPacket):
@@ -95,7 +111,7 @@ class IngestStage:
             ordered = self._camera(packet).order.push(packet)
         for p in ordered:
             self._camera(p).accept(p, self.budget.band_rows)
-        return self._close_batches() if ordered else []
+        return [*self._close_batches(), *self._word_of_events()] if ordered else []
 
     def _camera(self, packet: EventPacket) -> CameraStream:
         return self._left if packet.camera == "left" else self._right
@@ -111,13 +127,25 @@ class IngestStage:
 
     def _imu_samples(self, t_ns: I64, accel: F64, gyro: F64) -> ImuSamples:
         self._imu_seq += 1
-        # The open batch ends after every left event that is known, and at its end where that is known.
-        open_end = self._open.t_end_ns
-        event_t_ns = self._left.watermark_ns if open_end is None else open_end - 1
-        event_t_ns = max(event_t_ns, self._batch_t_ns)
+        self._told_ns = event_t_ns = self._event_t_ns
         return ImuSamples(
             self._imu_seq, self._imu.t_ns, event_t_ns, self._batch_seq, self._batch_t_ns, t_ns, accel, gyro
         )
+
+    @property
+    def _event_t_ns(self) -> int:
+        """The open batch ends after every left event that is known, and at its end where that is known."""
+        open_end = self._open.t_end_ns
+        event_t_ns = self._left.watermark_ns if open_end is None else open_end - 1
+        return max(event_t_ns, self._batch_t_ns)
+
+    def _word_of_events(self) -> list[ImuSamples]:
+        """One, where events have passed the time of an output since the last word.
+
+        With the next samples of the IMU it would come late by so much.
+        """
+        told, now = (int(t_ns * self._output_hz / NS_PER_S) for t_ns in (self._told_ns, self._event_t_ns))
+        return [self._no_samples(self._event_t_ns)] if now > told and self._imu.t_ns > 0 else []
 
     def _close_batches(self) -> list[Output]:
         out: list[Output] = []
@@ -243,10 +271,11 @@ class IngestStage:
         """What is known of the time stamps' errors."""
         return 0 if self._time_noise is None else self._time_noise.sigma_ns
 
-    def _no_samples(self, t_end_ns: int) -> ImuSamples:
+    def _no_samples(self, event_t_ns: int) -> ImuSamples:
         """Tells the optimizer how far the events have come without waiting for the IMU."""
         self._imu_seq += 1
+        self._told_ns = event_t_ns
         none, no_rows = np.empty(0, np.int64), np.empty((0, 3))
         return ImuSamples(
-            self._imu_seq, self._imu.t_ns, t_end_ns, self._batch_seq, self._batch_t_ns, none, no_rows, no_rows
+            self._imu_seq, self._imu.t_ns, event_t_ns, self._batch_seq, self._batch_t_ns, none, no_rows, no_rows
         )
