@@ -80,6 +80,7 @@ def test_a_configuration_file_that_is_open_is_refused(text: str, reason: str, tm
 def test_the_setting_opens_the_door(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("zenoh.open", lambda config: config)
     monkeypatch.setattr(session, "keep_from_blocking", lambda opened: None)
+    monkeypatch.setattr(session, "tell_of_links", lambda opened: None)
     config = open_session(ZenohSettings(listen="tcp/0.0.0.0:17447", insecure=True), introducer=True)
     assert "tcp/0.0.0.0:17447" in config.get_json("listen/endpoints")
 

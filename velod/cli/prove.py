@@ -143,8 +143,8 @@ def _soak(args: argparse.Namespace) -> int:
     out = _out(args)
     hits = ", ".join(f"{fault} {n} times" for fault, n in sorted(result.faults.items()))
     print(
-        f"{result.seconds:.0f} s; faults: {hits or 'none'}; {result.served} valid velocities,"
-        f" at the most {result.longest_gap_s:.2f} s apart; latency {result.latency_middle_ms:.1f} ms in the middle,"
+        f"{result.seconds:.0f} s; faults: {hits or 'none'}; {result.served} valid velocities;"
+        f" the longest time without one: {result.gap()}; latency {result.latency_middle_ms:.1f} ms in the middle,"
         f" {result.latency_last_ms:.1f} ms in the end",
         file=out,
     )

@@ -80,7 +80,7 @@ def besiege(recording: Path, speed: float) -> Siege:
             outcomes,
             [worker for worker, pid in pids.items() if after.get(worker) != pid or not Path(f"/proc/{pid}").exists()],
             target.n_heard() - heard,
-            target.longest_gap_s(),
+            target.longest_gap().seconds,
             {w: mib - before_mib[w] for w, mib in _resident_mib(target).items() if w in before_mib},
         )
 

@@ -12,6 +12,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from threading import Event, Thread
 from typing import Any
@@ -27,13 +28,28 @@ from velod.runtime.certificates import make_keys
 from velod.runtime.key_paths import KeyPaths
 from velod.runtime.session import client_tree, open_session, to_config
 from velod.runtime.stacked import Stacked
-from velod.types import Health
+from velod.types import Health, Velocity
 from velod.wire.topics import HEALTH
 
 RIG = "rig0"
 OTHER_RIG = "rig1"
 START_S = 120.0
 STAGES = ("ingest-0", "flow-0", "depth-0", "optimizer-0")
+
+
+@dataclass(frozen=True, slots=True)
+class Gap:
+    """A time without a valid velocity at the consumer, and what was heard in it."""
+
+    seconds: float
+    begun_s: float  # time.monotonic()
+    said: dict[str, str]  # by state of the velocities that were not valid: how many, and the last one's reason
+    alarms: dict[str, str]  # by "worker name": the last text
+
+    def __str__(self) -> str:
+        """What was heard, in words."""
+        heard = [f"{state}: {reason}" for state, reason in self.said.items()] or ["no velocity of any kind"]
+        return "; ".join(heard + [f"{name} ({text})" for name, text in sorted(self.alarms.items())])
 
 
 class SiegeError(RuntimeError):
@@ -48,7 +64,9 @@ class Besieged(Stacked):
     def __init__(self, recording: Path, speed: float) -> None:
         self._recording, self._speed = recording, speed
         self._health: dict[str, Health] = {}
-        self._heard_s: list[float] = []  # when the consumer was handed a velocity
+        self._heard_s: list[float] = []  # when the consumer was handed a valid velocity
+        self._unfit: list[tuple[float, str, str]] = []  # when it was handed another: state and reason
+        self._alarms: list[tuple[float, str, str]] = []  # when, "worker name", text
         self._stop = Event()
         self.port, self.tls_port = free_port(), free_port()
         self.keys = Path()
@@ -65,7 +83,8 @@ class Besieged(Stacked):
         self.wait_until(lambda: set(STAGES) <= set(self._health), START_S, "the service is not up")
         self.insider = stack.enter_context(open_session(here))
         # At another speed than 1 the sensor's time says nothing of age.
-        self._watch(stack, VelocityClient(RIG, self.endpoint, math.inf, keys=str(self.keys)), self._note_velocity)
+        consumer = VelocityClient(RIG, self.endpoint, math.inf, valid_only=False, keys=str(self.keys))
+        self._watch(stack, consumer, self._note_velocity)
         player = ["velod.runtime.player", str(self._recording), *self._player_arguments()]
         self.driver_pid = self._start(stack, player)
         self.wait_until(lambda: len(self._heard_s) > 10, START_S, "no velocity came")
@@ -99,13 +118,19 @@ class Besieged(Stacked):
         """Of the service and its workers."""
         return {worker: h.pid for worker, h in self._health.items() if h.stage != "driver"}
 
-    def longest_gap_s(self) -> float:
-        """Between two velocities at the consumer, until now."""
+    def longest_gap(self) -> Gap:
+        """Between two valid velocities at the consumer, until now."""
         heard = [*self._heard_s, time.monotonic()]
-        return max((b - a for a, b in itertools.pairwise(heard)), default=math.inf)
+        seconds, begun_s = max(((b - a, a) for a, b in itertools.pairwise(heard)), default=(math.inf, heard[0]))
+        said: dict[str, list[str]] = {}
+        for t_s, state, reason in self._unfit:
+            if begun_s < t_s < begun_s + seconds:
+                said.setdefault(state, []).append(reason)
+        alarms = {name: text for t_s, name, text in self._alarms if begun_s < t_s < begun_s + seconds}
+        return Gap(seconds, begun_s, {state: f"{len(r)} times, {r[-1]}" for state, r in said.items()}, alarms)
 
     def n_heard(self) -> int:
-        """Velocities at the consumer."""
+        """Valid velocities at the consumer."""
         return len(self._heard_s)
 
     def wait_until(self, condition: Callable[[], bool], timeout_s: float, otherwise: str) -> None:
@@ -160,10 +185,14 @@ class Besieged(Stacked):
     def _note_health(self, received: Any) -> None:
         health = received.envelope.message
         self._health[health.worker] = health
+        now_s = time.monotonic()
+        self._alarms += [(now_s, f"{health.worker} {name}", text) for name, text in health.alarms.items()]
 
-    def _note_velocity(self, velocity: Any) -> None:
-        del velocity
-        self._heard_s.append(time.monotonic())
+    def _note_velocity(self, velocity: Velocity) -> None:
+        if velocity.valid:
+            self._heard_s.append(time.monotonic())
+        else:
+            self._unfit.append((time.monotonic(), velocity.state, velocity.reason))
 
 
 def free_port() -> int:

@@ -14,6 +14,7 @@ import os
 import random
 import signal
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -40,6 +41,8 @@ MAX_DRIFT, MAX_DRIFT_SHORT = 1.5, 3.0
 """Median latency of the last third over that of the middle one; of a shorter run, which others may disturb."""
 MAX_GAP_S = 2 * STOPPED_S
 """Without a velocity: a process was stopped for STOPPED_S, or one that died had no spare and took as long to load."""
+ON_ITS_WAY_S = 0.1
+"""A gap begins with the last velocity before it, up to so long before the fault that made it."""
 _ANY, _STATELESS = ("ingest-0", "flow-0", "depth-0", "optimizer-0"), ("flow-0", "depth-0")
 
 
@@ -81,6 +84,9 @@ class Soak:
     faults: dict[str, int]  # "kill flow-0": times
     served: int  # valid velocities at the consumer
     longest_gap_s: float
+    gap_begun_s: float  # since the start
+    gap_after: str  # the last fault before it, and when
+    gap_heard: str  # states and reasons of invalid velocities in it, and alarms of all processes
     latency_middle_ms: float  # batch closed to velocity out, median of the middle third
     latency_last_ms: float
     processes: list[Lasting]
@@ -103,8 +109,15 @@ class Soak:
         if not self.served:
             found.append("no velocity came")
         elif self.longest_gap_s > MAX_GAP_S:
-            found.append(f"no velocity for {self.longest_gap_s:.1f} s")
+            found.append(f"no velocity for {self.gap()}")
         return found
+
+    def gap(self) -> str:
+        """The longest one in words."""
+        return (
+            f"{self.longest_gap_s:.2f} s from {self.gap_begun_s:.1f} s on, after {self.gap_after}; "
+            f"heard meanwhile: {self.gap_heard}"
+        )
 
 
 def soak(recording: Path, seconds: float, fault_every_s: float, seed: int, on_fault: Callable[[str], None]) -> Soak:
@@ -112,8 +125,7 @@ def soak(recording: Path, seconds: float, fault_every_s: float, seed: int, on_fa
     chance = random.Random(seed)
     series: dict[str, Series] = {}
     latency_ms: list[tuple[float, float]] = []
-    faults: dict[str, int] = {}
-    killed_s: list[float] = []
+    hits: list[tuple[float, str]] = []
     with Besieged(recording, speed=1.0) as target:
         start_s = time.monotonic()
         next_fault_s = start_s + fault_every_s
@@ -126,17 +138,21 @@ def soak(recording: Path, seconds: float, fault_every_s: float, seed: int, on_fa
                 seen = health.seq
                 latency_ms.append((elapsed_s, health.latency_ms["end_to_end_p50"]))
             if time.monotonic() >= next_fault_s and elapsed_s < 2 * seconds / 3 - WARM_UP_S:
-                fault = _hit(target, chance, _ANY if elapsed_s < seconds / 3 else _STATELESS)
-                faults[fault] = faults.get(fault, 0) + 1
-                if fault.startswith("kill"):
-                    killed_s.append(elapsed_s)
-                on_fault(f"{elapsed_s:.0f} s: {fault}")
+                hit_s = time.monotonic() - start_s
+                hits.append((hit_s, _hit(target, chance, _ANY if elapsed_s < seconds / 3 else _STATELESS)))
+                on_fault(f"{hit_s:.1f} s: {hits[-1][1]}")
                 next_fault_s = time.monotonic() + fault_every_s * chance.uniform(0.7, 1.3)
+        gap = target.longest_gap()
+        gap_begun_s = gap.begun_s - start_s
+        killed_s = [hit_s for hit_s, fault in hits if fault.startswith("kill")]
         return Soak(
             elapsed_s,
-            faults,
+            Counter(fault for _, fault in hits),
             target.n_heard() - served,
-            target.longest_gap_s(),
+            gap.seconds,
+            gap_begun_s,
+            _last_before(gap_begun_s, hits),
+            str(gap),
             _median(latency_ms, seconds / 3, 2 * seconds / 3),
             _median(latency_ms, 2 * seconds / 3, seconds),
             [_judge(w, s, seconds, killed_s) for w, s in sorted(series.items()) if _lasted(s, seconds)],
@@ -157,6 +173,12 @@ def _hit(target: Besieged, chance: random.Random, workers: tuple[str, ...]) -> s
     except ProcessLookupError:
         return f"{worker} was gone"  # replaced a moment ago, and its health has not been heard yet
     return f"stop {worker}"
+
+
+def _last_before(t_s: float, hits: list[tuple[float, str]]) -> str:
+    """The last fault before the gap that began at ``t_s``, which a velocity on its way may have put off."""
+    before = [f"{fault} at {hit_s:.1f} s" for hit_s, fault in hits if hit_s < t_s + ON_ITS_WAY_S]
+    return before[-1] if before else "no fault"
 
 
 def _sample(target: Besieged, series: dict[str, Series], t_s: float) -> None:

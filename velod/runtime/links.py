@@ -43,18 +43,37 @@ def keep_from_blocking(session: zenoh.Session) -> None:
 
 def set_options(src: str, dst: str) -> int:
     """Set the options of this process's sockets from locator ``src`` to ``dst``; returns how many there are."""
+    found = 0
+    for link in _sockets_between(src, dst):
+        link.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _NO_LINGER)
+        with suppress(OSError):  # an older kernel
+            link.setsockopt(socket.IPPROTO_TCP, _TCP_RTO_MIN_US, RETRANSMIT_MIN_US)
+        found += 1
+    return found
+
+
+def cut(session: zenoh.Session, peer: str) -> None:
+    """End the TCP links of ``session`` to ``peer`` (its id), as if the network had: Zenoh makes those anew that it
+    was configured to have. Does nothing where Linux's ways are missing.
+    """
+    if sys.platform != "linux":
+        return
+    for link in session.info.links():
+        if str(link.zid) == peer:
+            for end in _sockets_between(link.src, link.dst):
+                with suppress(OSError):  # ended by itself
+                    end.shutdown(socket.SHUT_RDWR)
+
+
+def _sockets_between(src: str, dst: str) -> Iterator[socket.socket]:
+    """Duplicates of this process's sockets from locator ``src`` to ``dst``, each open for one round of a loop."""
     ends = (_address(src), _address(dst))
     if None in ends:
-        return 0  # a link of another kind
-    found = 0
+        return  # a link of another kind
     for link in _tcp_sockets():
         with link:
             if ends == _ends(link):
-                link.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _NO_LINGER)
-                with suppress(OSError):  # an older kernel
-                    link.setsockopt(socket.IPPROTO_TCP, _TCP_RTO_MIN_US, RETRANSMIT_MIN_US)
-                found += 1
-    return found
+                yield link
 
 
 def _address(locator: str) -> tuple[str, int] | None:

@@ -25,6 +25,7 @@ from velod.runtime.endpoints import ANY_HOST, Endpoint, SessionError, parse, ref
 from velod.runtime.key_paths import KeyPaths
 from velod.runtime.links import keep_from_blocking
 from velod.runtime.pools import POOL_BYTES
+from velod.runtime.relink import keep_linked, tell_of_links
 from velod.wire.codec import MAX_BYTES
 
 __all__ = ["SessionError", "introducer_endpoint", "open_session"]
@@ -60,6 +61,10 @@ def open_config(config: zenoh.Config, settings: ZenohSettings, introducer: bool 
             raise
         raise SessionError(_explain(str(e), settings, introducer)) from None
     keep_from_blocking(session)
+    if introducer:
+        tell_of_links(session)
+    else:
+        keep_linked(session)
     return session
 
 

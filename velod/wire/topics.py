@@ -70,6 +70,9 @@ TOPICS: dict[str, Topic] = {
     )
 }
 
+LINKED = "velod/linked"
+"""The one key of no rig, and of no topic: asked with whom it is linked, the introducer answers."""
+
 _PART = re.compile(r"\{(\w+)\}")
 _FORBIDDEN = frozenset("/*$?# ")
 ANY_RIG = "*"
