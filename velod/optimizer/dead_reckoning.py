@@ -22,7 +22,7 @@ class DeadReckoning:
 
     def __init__(self, correlation_s: float, gyro_noise: float) -> None:
         """``correlation_s``: how long an error of the velocity lasts; ``gyro_noise``: density, rad/s/sqrt(Hz)."""
-        self._correlation_s, self._gyro_noise = correlation_s, gyro_noise
+        self._correlation_s, self.gyro_noise = correlation_s, gyro_noise
         self._seq = 0
         self.stop()
 
@@ -59,7 +59,7 @@ class DeadReckoning:
     def _go_on(self, t_ns: int, v_B: F64, cov: F64, R_LB: F64, g_B: F64, tilt_cov: F64) -> None:
         dt = (t_ns - self._t_ns) / NS_PER_S
         self._distance_m += _go_on(
-            dt, v_B, cov, self._R_LB, R_LB, g_B, tilt_cov, 2.0 * self._correlation_s * dt, self._gyro_noise**2 * dt,
+            dt, v_B, cov, self._R_LB, R_LB, g_B, tilt_cov, 2.0 * self._correlation_s * dt, self.gyro_noise**2 * dt,
             self._v_O, self._R_OB, self._p_O, self._cov,
         )  # fmt: skip
 

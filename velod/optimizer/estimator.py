@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from velod.config import Settings
+from velod.config import ImuSettings, Settings
 from velod.events.sensor_size import for_sensor
 from velod.geometry.calibration import Calibration
 from velod.geometry.rectify import rectify
@@ -18,6 +18,7 @@ from velod.optimizer.depth_share import cameras_disagree
 from velod.optimizer.equations import EquationMaker, Equations, Prediction
 from velod.optimizer.flow_equation import BIN_NS, COMMON, RIDGE, Bins, Fit, Rows
 from velod.optimizer.frame import Rate
+from velod.optimizer.imu_noise import ImuNoise
 from velod.optimizer.inertial import InertialMemory
 from velod.optimizer.interval import Interval
 from velod.optimizer.preintegration import Preintegration, preintegrate
@@ -37,6 +38,8 @@ RESTING_SIGMA = 0.002
 """m/s, of what may have begun since rest was observed last and the IMU does not show."""
 BIAS_TRIAL_NS, BIAS_TRIAL_SIGMAS = 2_000_000_000, 3.0
 """A bias that is found so large so soon was not drawn with its specified sigma ..."""
+NOISE_TRIAL_NS, MUCH_NOISIER = 300_000_000, 1.5
+"""Noise that is found so soon, and so much more of it, was in all that has been taken in."""
 BIAS_MARGIN = 10.0
 """... which is then taken this many times: always, it would cost a third of the accuracy."""
 USUAL_DEPTH = 3.0
@@ -88,7 +91,8 @@ class Estimator:
         o = settings.optimizer
         rect = rectify(calibration)
         ingest = for_sensor(settings, calibration.left.width, calibration.left.height).ingest
-        self._o, self._imu, self._ingest = o, settings.imu, ingest
+        self._o, self._ingest = o, ingest
+        self.imu_noise = ImuNoise(settings.imu)
         self.camera = (rect.f, rect.cx, rect.cy)
         self._maker = EquationMaker(self.camera, rect.R_CB, rect.p_BC_B)
         self._knot_ns = int(o.knot_s * NS_PER_S)
@@ -103,6 +107,10 @@ class Estimator:
         )
         self._standstill = Standstill(settings.imu, calibration.left.width * calibration.left.height)
         self._forget()
+
+    @property
+    def _imu(self) -> ImuSettings:
+        return self.imu_noise.settings
 
     def _forget(self) -> None:
         """Nothing is known of the velocity."""
@@ -135,6 +143,7 @@ class Estimator:
     def absorb(self, flow: FlowBatch, depth: DepthBatch) -> None:
         """Take a batch in; the IMU must cover its end. A batch older than the head adds what it knows."""
         self.memory.integrate_to(flow.t_ns, *self._biases())
+        self._look_at_noise(flow.t_ns)
         self._start_anew_where_it_is_wrong(flow.t_ns)
         self._correct_stamps(flow.t_ns)
         equations = self._equations(flow, depth)
@@ -157,6 +166,24 @@ class Estimator:
             self._add_standstill(flow.t_ns)
         self._solve_head(self.head.t_ns if late and self.head is not None else flow.t_ns)
         self._keep_error_small()
+
+    def _look_at_noise(self, t_ns: int) -> None:
+        """Use the noise that the IMU shows; an estimate that began with much less of it begins anew."""
+        before = self._imu
+        if not self.imu_noise.look(self.memory, t_ns):
+            return
+        self._count("imu.noise_changed")
+        self.rotation_check.gyro_noise = self._imu.gyro_noise
+        self._standstill.imu = self._imu
+        if self.window.empty:
+            return
+        more = max(self._imu.accel_noise / before.accel_noise, self._imu.gyro_noise / before.gyro_noise)
+        if more > MUCH_NOISIER and t_ns - self._started_ns < NOISE_TRIAL_NS:
+            self._forget()
+        else:
+            self.window.use_noise(self._imu)
+            for interval in self._open:
+                interval.noise_changed()
 
     def _start_anew_where_it_is_wrong(self, t_ns: int) -> None:
         """Forget an estimate that no further batch can save."""

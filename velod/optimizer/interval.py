@@ -89,11 +89,15 @@ class Interval:
         self.flows.eta += self.flows.L[:, :, :3] @ offset + self.flows.L[:, :, 6:] @ common
         self._folded = False
 
+    def noise_changed(self) -> None:
+        """The next ``fold`` is with another noise."""
+        self._folded = False
+
     def fold(self, noise_information: float, knot_ns: int, first: int, H: F64, h: F64, end: I64) -> None:
         """Add what IMU and flows say to the normal equations of a window whose first segment is ``first``.
 
-        ``noise_information``: of the gyroscope's noise in one bin, (rad/s)^-2. Noise and knots are the same in every
-        call: an interval that has got nothing new since the last one has its sum still.
+        ``noise_information``: of the gyroscope's noise in one bin, (rad/s)^-2. Knots are the same in every call, and
+        noise until ``noise_changed``: an interval that has got nothing new since the last one has its sum still.
         """
         if not self._folded:
             _fold(

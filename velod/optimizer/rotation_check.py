@@ -88,7 +88,7 @@ class RotationCheck:
 
         ``correct``: whether a delay is ever to be taken out of the stamps.
         """
-        self._gyro_noise, self._correct = gyro_noise, correct
+        self.gyro_noise, self._correct = gyro_noise, correct
         self._pending: deque[_Turn] = deque()
         self._axes, self._clock = _Sums(delay_sigma_s), _Sums(delay_sigma_s)
         self.late_ns = 0
@@ -115,7 +115,7 @@ class RotationCheck:
             if turn.t_ns - FAR_NS < memory.t_ns[0]:
                 continue
             w_B, w_dot_B = _rates(turn.t_ns, memory)
-            variance = self._gyro_noise**2 / turn.span_s
+            variance = self.gyro_noise**2 / turn.span_s
             closed = self._clock.add(turn, True, variance, w_B, w_dot_B)
             self._axes.add(turn, False, variance, w_B, w_dot_B)
             if closed and (step := self._conclude()) != 0.0:

@@ -35,6 +35,8 @@ EARLY_NS, EARLY_FACTOR = 70_000_000, 0.5
 """... times EARLY_FACTOR while less than EARLY_NS have been seen, when gravity is hardly known ..."""
 LATE_NS, LATE_SIGMA = 300_000_000, 0.2
 """... or below LATE_SIGMA m/s from LATE_NS on: a velocity that tells its uncertainty is worth more than none ..."""
+SETTLED_NS, SETTLED_SIGMA = NS_PER_S, 0.3
+"""... or SETTLED_SIGMA once a window is full: a poor IMU will not know it better ..."""
 LOST_FACTOR = 4.0
 """... and stays valid until it is this many times larger."""
 DEGRADED_AFTER_NS = 100_000_000
@@ -43,6 +45,10 @@ CLOCK_RESTART_NS = 10 * NS_PER_S
 """Events this far back in time mean that the sensor's clock was set anew."""
 IMU_GAP_NS = NS_PER_S // 10
 """A longer hole in the IMU cannot be bridged, for nobody knows how the sensor turned: start anew."""
+
+NOISE = "imu.noise"
+ALARM_NOISE = 2.0
+"""Times the specified noise density of the IMU from which on an alarm asks whether the settings are of this IMU."""
 
 
 class OptimizerStage:
@@ -276,6 +282,7 @@ class OptimizerStage:
                 return
         self._estimator.absorb(flow, depth)
         self._check_calibration(flow, depth)
+        self._check_noise()
         if flow.t_ns > self._newest[1]:
             self._newest = (seq, flow.t_ns)
 
@@ -285,6 +292,17 @@ class OptimizerStage:
             self._check.add_solution(*own)
         if (offsets := self._estimator.rotation_check.offsets) is not None:
             self._check.add_offsets(offsets)
+
+    def _check_noise(self) -> None:
+        """The IMU's noise as it shows, in the dead reckoning too; an alarm where it is far from the settings."""
+        noise = self._estimator.imu_noise
+        self._reckoning.gyro_noise = noise.settings.gyro_noise
+        accel, gyro = noise.excess
+        self.alarms.pop(NOISE, None)
+        if max(accel, gyro) > ALARM_NOISE:
+            self.alarms[NOISE] = (
+                f"the accelerometer has {accel:.1f} and the gyroscope {gyro:.1f} times the noise of the settings"
+            )
 
     def put_out(self, tau: int) -> list[Velocity | Odometry]:
         """The velocity at ``tau`` from what has been taken in; with its dead reckoning where it is valid."""
@@ -337,7 +355,8 @@ class OptimizerStage:
             seen_ns = tau - self._estimator.first_usable_t_ns
             # nothing may speak against IMU or calibration: what is uncertain for that is wrong
             late = seen_ns >= LATE_NS and not self._was_lost and self._estimator.biases_as_specified
-            if sigma > (EARLY_FACTOR * limit if seen_ns < EARLY_NS else max(limit, LATE_SIGMA) if late else limit):
+            patient = SETTLED_SIGMA if seen_ns >= SETTLED_NS else LATE_SIGMA
+            if sigma > (EARLY_FACTOR * limit if seen_ns < EARLY_NS else max(limit, patient) if late else limit):
                 return state, self._uncertain(tau, sigma), False
             self._was_valid, self._was_lost = True, False
         if sigma > LOST_FACTOR * limit:

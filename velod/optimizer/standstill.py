@@ -47,7 +47,7 @@ class Standstill:
 
     def __init__(self, imu: ImuSettings, pixels: int) -> None:
         """``pixels``: of the left sensor."""
-        self._imu, self._pixels = imu, pixels
+        self.imu, self._pixels = imu, pixels
         self._t_ns = -1
         self._event_hz = 0.0  # per pixel, in the newest batch
         self._quiet_since_ns = -1
@@ -108,13 +108,13 @@ class Standstill:
         if len(gyro) < 10:
             return False
         rate_hz = len(gyro) / (QUIET_NS * 1e-9)
-        gyro_noise, accel_noise = self._imu.gyro_noise * rate_hz**0.5, self._imu.accel_noise * rate_hz**0.5
+        gyro_noise, accel_noise = self.imu.gyro_noise * rate_hz**0.5, self.imu.accel_noise * rate_hz**0.5
         return bool(
             np.all(gyro.std(axis=0) < max(SIGMAS * gyro_noise, GYRO_FLOOR))
             and np.all(accel.std(axis=0) < max(SIGMAS * accel_noise, ACCEL_FLOOR))
-            and np.linalg.norm(gyro.mean(axis=0) - b_w) < MAX_RATE + BIAS_SIGMAS * self._imu.gyro_bias_sigma
-            and abs(np.linalg.norm(accel.mean(axis=0)) - self._imu.gravity)
-            < MAX_SPECIFIC_FORCE_ERROR + BIAS_SIGMAS * self._imu.accel_bias_sigma
+            and np.linalg.norm(gyro.mean(axis=0) - b_w) < MAX_RATE + BIAS_SIGMAS * self.imu.gyro_bias_sigma
+            and abs(np.linalg.norm(accel.mean(axis=0)) - self.imu.gravity)
+            < MAX_SPECIFIC_FORCE_ERROR + BIAS_SIGMAS * self.imu.accel_bias_sigma
         )
 
 

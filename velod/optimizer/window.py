@@ -77,8 +77,8 @@ class Window:
         self._bias_margin = bias_margin
         self._common_sigma = common_sigma
         self._common_lasts = np.ones(3)
-        self._imu = imu
-        self._noise_information = BIN_NS * 1e-9 / imu.gyro_noise**2 if shared_gyro_noise else NO_NOISE
+        self._shared_gyro_noise = shared_gyro_noise
+        self.use_noise(imu)
         self._knot_ns = knot_ns
         self._segments = segments
         self._smoothness = smoothness
@@ -96,6 +96,11 @@ class Window:
         self._forward = np.zeros(size)
         self.first = 0
         self.last = -1
+
+    def use_noise(self, imu: ImuSettings) -> None:
+        """From here on the IMU has these densities and walks; what has been added keeps its own."""
+        self._imu = imu
+        self._noise_information = BIN_NS * 1e-9 / imu.gyro_noise**2 if self._shared_gyro_noise else NO_NOISE
 
     @property
     def empty(self) -> bool:
