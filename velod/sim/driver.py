@@ -20,7 +20,7 @@ from velod.io.recording import open_recording
 from velod.sim.run import Progress, simulate
 from velod.sim.sequences import sequence
 
-MODEL_VERSION = 4
+MODEL_VERSION = 5
 """Raised with every change of the simulator that changes what it records."""
 
 

@@ -12,6 +12,7 @@ from numba import njit
 
 from velod.io.model import EventColumns
 from velod.sim.effects import Effects, Noise, SensorError, merged
+from velod.sim.kernels import SAME_BITS
 from velod.types import F32, I64, U8, U16
 
 LOG_EPS = 1e-3
@@ -154,7 +155,7 @@ def _emit(
     return count
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=SAME_BITS, error_model="numpy")
 def _log_row(intensity: F32, out: F32) -> None:
     """log(eps + intensity) to 2e-6, several times as fast as the library's: LLVM vectorises it."""
     one, third, fifth, seventh = np.float32(1.0), np.float32(1.0 / 3.0), np.float32(0.2), np.float32(1.0 / 7.0)

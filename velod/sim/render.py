@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from velod.geometry.calibration import Camera
 from velod.geometry.camera import normalised, undistort
+from velod.sim.kernels import SAME_BITS
 from velod.sim.scene import Scene
 from velod.sim.texture import COARSEST, SIZE, TEXEL_M, Texture, sample
 from velod.types import F32, F64, I64
@@ -131,7 +132,7 @@ def _cast_room(shell: F64, R_WC: F64, p: F64, rays: F32, areas: I64, depth: F32,
             _leave_room(view, rays[0, j, i0:i1], rays[1, j, i0:i1], depth[j, i0:i1], surface[j, i0:i1])
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=SAME_BITS, error_model="numpy")
 def _leave_room(view: F32, xs: F32, ys: F32, depth: F32, surface: I32) -> None:
     r00, r01, r02, r10, r11, r12, r20, r21, r22 = (
         view[0], view[1], view[2], view[3], view[4], view[5], view[6], view[7], view[8],
@@ -154,7 +155,7 @@ def _leave_room(view: F32, xs: F32, ys: F32, depth: F32, surface: I32) -> None:
         surface[i] = face if nearest < to_z else face_z
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=SAME_BITS, error_model="numpy")
 def _inverse(d: np.float32) -> np.float32:
     """1 / d, large but finite for zero."""
     tiny = np.float32(1e-12)
@@ -226,7 +227,7 @@ def _cast_boxes(aimed: F32, margin: float, rays: F32, areas: I64, depth: F32, su
                 )  # fmt: skip
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=SAME_BITS, error_model="numpy")
 def _hit_box(box: F32, first: np.int32, xs: F32, ys: F32, depth: F32, surface: I32) -> None:
     """Where each ray enters |x| < hx, |y| < hy, |z| < hz of the box's own axes, and through which face."""
     r00, r01, r02, r10, r11, r12, r20, r21, r22 = (
@@ -327,7 +328,7 @@ def _shade(
             _sample_row(texels, flat, starts, work, intensity[j, first:end])
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=SAME_BITS, error_model="numpy")
 def _locate_on_plane(surface: F32, view: F32, xs: F32, ys: F32, depth: F32, work: F32) -> None:
     """Fill ``work``, from the first element of each part on, for a run of pixels that see one plane."""
     r00, r10, r20 = view[0], view[1], view[2]
@@ -358,7 +359,7 @@ def _locate_on_plane(surface: F32, view: F32, xs: F32, ys: F32, depth: F32, work
         work[at + _HALF_U], work[at + _HALF_V], work[at + _FOOTPRINT2] = _taps(u_x, v_x, u_y, v_y)
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=SAME_BITS, error_model="numpy")
 def _locate_on_cylinder(surface: F32, view: F32, xs: F32, ys: F32, depth: F32, work: F32) -> None:
     """As ``_locate_on_plane``, for an upright cylinder about W's z axis."""
     r00, r10, r20 = view[0], view[1], view[2]
@@ -387,7 +388,7 @@ def _locate_on_cylinder(surface: F32, view: F32, xs: F32, ys: F32, depth: F32, w
         work[at + _HALF_U], work[at + _HALF_V], work[at + _FOOTPRINT2] = _taps(u_x, v_x, u_y, v_y)
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=SAME_BITS, error_model="numpy")
 def _taps(
     u_x: np.float32, v_x: np.float32, u_y: np.float32, v_y: np.float32
 ) -> tuple[np.float32, np.float32, np.float32]:
@@ -401,7 +402,7 @@ def _taps(
     return half_u, half_v, max(quarter * long2, area * area / long2)
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=SAME_BITS, error_model="numpy")
 def _sample_row(texels: F32, flat: F32, starts: U32, work: F32, intensity: F32) -> None:
     """The mean of each pixel's two samples, between the two levels of the pyramid around its footprint."""
     one, half = np.float32(1.0), np.float32(0.5)
@@ -431,7 +432,7 @@ def _sample_row(texels: F32, flat: F32, starts: U32, work: F32, intensity: F32) 
         intensity[i] = half * (first + second)
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=SAME_BITS, error_model="numpy")
 def _atan2(y: np.float32, x: np.float32) -> np.float32:
     """atan2 to 1e-6 rad (Abramowitz and Stegun 4.4.49), several times as fast as the library's."""
     f32 = np.float32

@@ -13,6 +13,7 @@ from functools import lru_cache
 import numpy as np
 from numba import njit
 
+from velod.sim.kernels import SAME_BITS
 from velod.types import F32, F64, I64
 
 SIZE = 2048
@@ -119,7 +120,7 @@ def _flat(darkest: F32, brightest: F32) -> F32:
     return np.where(darkest == brightest, brightest, np.float32(-1.0))
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=SAME_BITS, error_model="numpy")
 def sample(
     texels: F32,
     start: np.uint32,
@@ -141,7 +142,7 @@ def sample(
     return blend
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=SAME_BITS, error_model="numpy")
 def _bilinear(texels: F32, start: np.uint32, size: np.uint32, x: np.float32, y: np.float32) -> np.float32:
     """Between the four texels of a level around (x, y); the centre of texel i lies at i."""
     x0, y0 = np.floor(x), np.floor(y)
