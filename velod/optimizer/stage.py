@@ -7,7 +7,7 @@ stays away for longer than ``max_wait_ms`` of sensor time is a velocity made wit
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -23,6 +23,7 @@ from velod.optimizer.estimator import Estimator
 from velod.optimizer.frame import output_frame
 from velod.optimizer.inertial import continues
 from velod.optimizer.parts import Parts, batch_seq
+from velod.optimizer.rotation_check import Offsets
 from velod.types import F64, NS_PER_S, DepthBatch, FlowBatch, ImuSamples, Odometry, TrackingState, Velocity
 
 UNKNOWN_SIGMA = 100.0
@@ -51,6 +52,16 @@ ALARM_NOISE = 2.0
 """Times the specified noise density of the IMU from which on an alarm asks whether the settings are of this IMU."""
 
 
+@dataclass(frozen=True, slots=True)
+class _Unchecked:
+    """A batch that was taken in, with what the estimator then said of it."""
+
+    flow: FlowBatch
+    depth: DepthBatch
+    own_solution: tuple[int, F64, F64] | None
+    offsets: Offsets | None
+
+
 class OptimizerStage:
     """``handle(FlowBatch | DepthBatch | ImuSamples) -> [Velocity | Odometry]``."""
 
@@ -70,6 +81,7 @@ class OptimizerStage:
         self._taken: set[int] = set()  # taken in before an earlier one that is still missing
         self._next_seq = -1  # first batch not yet taken in nor given up; -1: nothing heard from ingest yet
         self._closed_seq = -1  # newest batch that ingest has closed
+        self._unchecked: list[_Unchecked] = []  # against the calibration
         self._reset()
         self._check = CalibrationCheck(settings.optimizer, self._estimator.camera)
         self.alarms, self.gauges = self._check.alarms, self._check.gauges
@@ -91,6 +103,7 @@ class OptimizerStage:
 
         Raises TypeError for other messages.
         """
+        self.tidy()
         if isinstance(message, ImuSamples):
             self._take_imu(message)
         elif isinstance(message, FlowBatch | DepthBatch):
@@ -281,17 +294,23 @@ class OptimizerStage:
                 self._count("batch.too_late")
                 return
         self._estimator.absorb(flow, depth)
-        self._check_calibration(flow, depth)
+        own, offsets = self._estimator.own_solution, self._estimator.rotation_check.offsets
+        self._unchecked.append(
+            _Unchecked(flow, depth, own if own is not None and own[0] == flow.t_ns else None, offsets)
+        )
         self._check_noise()
         if flow.t_ns > self._newest[1]:
             self._newest = (seq, flow.t_ns)
 
-    def _check_calibration(self, flow: FlowBatch, depth: DepthBatch) -> None:
-        self._check.add_batch(flow, depth)
-        if (own := self._estimator.own_solution) is not None and own[0] == flow.t_ns:
-            self._check.add_solution(*own)
-        if (offsets := self._estimator.rotation_check.offsets) is not None:
-            self._check.add_offsets(offsets)
+    def tidy(self) -> None:
+        """Check the calibration against the newest batches: no velocity needs to wait for that."""
+        for batch in self._unchecked:
+            self._check.add_batch(batch.flow, batch.depth)
+            if batch.own_solution is not None:
+                self._check.add_solution(*batch.own_solution)
+            if batch.offsets is not None:
+                self._check.add_offsets(batch.offsets)
+        self._unchecked.clear()
 
     def _check_noise(self) -> None:
         """The IMU's noise as it shows, in the dead reckoning too; an alarm where it is far from the settings."""

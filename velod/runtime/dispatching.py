@@ -22,6 +22,9 @@ IMPATIENCE_S = 0.05
 MAX_WAIT_S = 0.5
 """A batch that has waited for longer is not sent any more: half the optimizer's window is over."""
 
+LOOK_S = 0.005
+"""Between looks for batches that have been outstanding for too long."""
+
 SENT = "sent."
 """Begins the names of the counters of batches sent to each worker."""
 
@@ -40,6 +43,7 @@ class BatchDispatch:
             for stage in _TOPIC
         }
         self._sent: dict[str, int] = {}  # batches, by worker
+        self._look_s = 0.0
 
     def send(self, batch: EventBatch | StereoBatch, t_origin_ns: int) -> None:
         """Give a batch to a worker now, or as soon as one is free."""
@@ -63,8 +67,11 @@ class BatchDispatch:
 
     def expire(self) -> None:
         """Take back what has been outstanding for too long; call often."""
+        if (now_s := time.monotonic()) < self._look_s:
+            return
+        self._look_s = now_s + LOOK_S
         for stage, dispatcher in self._dispatchers.items():
-            self._put(stage, dispatcher.expire(time.monotonic()))
+            self._put(stage, dispatcher.expire(now_s))
 
     def load(self, *stages: str) -> tuple[float, int]:
         """Of the busiest of ``stages``: how long a new batch's predecessors have been there, s, and how many wait."""

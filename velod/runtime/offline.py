@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 
 from velod.config import Settings
 from velod.geometry.calibration import Calibration
-from velod.runtime.stages import STAGES, Stage, alarms_of, create_stage
+from velod.runtime.stages import STAGES, Stage, Tidying, alarms_of, create_stage
 from velod.types import EventBatch, EventPacket, ImuPacket, Message, StereoBatch, Velocity
 
 
@@ -30,6 +30,9 @@ def run_offline(
             _note(velocity, on_message)
             if isinstance(velocity, Velocity):
                 velocities.append(velocity)
+    for stage in stages.values():
+        if isinstance(stage, Tidying):
+            stage.tidy()
     if counters is not None:
         counters.update({name: dict(stage.counters) for name, stage in stages.items()})
     if alarms is not None:

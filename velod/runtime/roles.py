@@ -53,6 +53,7 @@ class IngestShell(WorkerShell):
         self, session: zenoh.Session, settings: Settings, stage_name: str, worker: str, stage: Stage
     ) -> None:
         super().__init__(session, settings, stage_name, worker, stage)
+        self._limited = stage if isinstance(stage, Limited) else None
         self._sensor_clock = SensorClockFit()
         self._dispatch = BatchDispatch(self.outlet, settings.zenoh.lossless)
         # A lossless replay waits for the slowest instead.
@@ -83,8 +84,8 @@ class IngestShell(WorkerShell):
             self._load.note_workers(*self._dispatch.load("depth"), now_s)
         else:
             self._load.note_workers(*self._dispatch.load("flow", "depth"), now_s)
-        if isinstance(self.stage, Limited):
-            self.stage.budget = self._load.budget()
+        if self._limited is not None:
+            self._limited.budget = self._load.budget()
         return False
 
     def consumers(self) -> list[tuple[Topic, dict[str, str]]]:

@@ -22,7 +22,7 @@ from velod.runtime.inbox import Inbox, Item
 from velod.runtime.measure import GapCounter
 from velod.runtime.outlet import Outlet
 from velod.runtime.pools import PoolKeeper
-from velod.runtime.stages import Stage, alarms_of, gauges_of
+from velod.runtime.stages import Stage, Tidying, alarms_of, gauges_of
 from velod.types import Message
 from velod.wire import Envelope, WireError, decode
 from velod.wire.topics import ALIVE, HEALTH, Topic, key, parts
@@ -65,6 +65,7 @@ class WorkerShell:
         self._heard: dict[str, tuple[Topic, float]] = {}  # by key: when the last message came
         self._logged: set[str] = set()
         self._pools = PoolKeeper()
+        self._tidying = stage if isinstance(stage, Tidying) else None
         self._t_ns = 0
         self.arrived_ns = 0  # host clock, when what is being handled came in; it may have waited since
 
@@ -218,6 +219,9 @@ class WorkerShell:
             outputs = self.handle(envelope.message)
         with self.survived(item.key, envelope):
             self.publish(outputs, envelope)
+        if self._tidying is not None:
+            with self.survived(item.key, envelope):
+                self._tidying.tidy()
 
     @contextmanager
     def survived(self, at: str, envelope: Envelope) -> Iterator[None]:

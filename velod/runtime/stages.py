@@ -53,6 +53,15 @@ class Inertial(Protocol):
         ...
 
 
+@runtime_checkable
+class Tidying(Protocol):
+    """A stage with work that its outputs need not wait for."""
+
+    def tidy(self) -> None:
+        """Do what was put off; ``handle`` begins with it, so nothing is put off for longer than a message."""
+        ...
+
+
 _CLASSES = {
     "ingest": ("velod.ingest.stage", "IngestStage"),
     "flow": ("velod.flow.stage", "FlowStage"),
