@@ -13,6 +13,7 @@ from velod.cli.bench import bench
 from velod.eval import bench_input
 from velod.eval.bench import Case, Result, Size, measure
 from velod.eval.bench_cases import GROUPS, cases
+from velod.eval.latency import LEGS
 from velod.types import Velocity
 
 TINY = Size(repeats=2, peer_repeats=1, seconds=0.12, dataflow_seconds=0.5, events=20_000, flows=60, window=20)
@@ -24,6 +25,7 @@ NAMES = {
     "codec": ["codec.batch"],
     "pipeline": ["ingest.batch", "ingest.hd", "pipeline.one_process", "pipeline.sustained", "pipeline.event_to_flow"],
     "hop": ["hop.velod", "hop.zenoh"],
+    "latency": [f"latency.{leg}" for leg in LEGS],
 }
 PEERS = {"flow.plane_fit": 1e-3, "depth.sparse_500": 0.5, "solve.window": 1e-3, "codec.batch": 0.0}
 """How far a case may be from its peer: relative speed, px, relative information, differing fields."""
@@ -37,7 +39,7 @@ def test_all_writes_every_name_with_times_and_ratios(tmp_path: Path, capsys: pyt
     out = tmp_path / "bench.json"
     assert bench("all", str(out), TINY) == 0
     rows = json.loads(out.read_text())
-    assert [r["name"] for r in rows] == [name for group in (*GROUPS, "hop") for name in NAMES[group]]
+    assert [r["name"] for r in rows] == [name for group in (*GROUPS, "hop", "latency") for name in NAMES[group]]
     table = capsys.readouterr().out
     for r in rows:
         assert r["name"] in table
@@ -46,6 +48,7 @@ def test_all_writes_every_name_with_times_and_ratios(tmp_path: Path, capsys: pyt
             assert r["peer"] and r["ratio"] == pytest.approx(r["peer_median_us"] / r["median_us"])
         else:
             assert (r["peer"], r["peer_median_us"], r["ratio"]) == (None, None, None)
+    assert all(r["p99_us"] >= r["median_us"] for r in rows if r["name"] in NAMES["latency"])
     assert all(r["mev_s"] > 0.0 for r in rows if r["name"] in ("pipeline.one_process", "pipeline.sustained"))
 
 

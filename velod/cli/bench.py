@@ -20,6 +20,7 @@ from velod.eval import bench_input
 from velod.eval.bench import Result, Size, measure
 from velod.eval.bench_cases import GROUPS, Packets, cases
 from velod.eval.bench_input import RIG, record
+from velod.eval.latency import LEGS, Trace
 from velod.runtime.hop import measure as measure_hop
 from velod.runtime.offline import run_offline
 from velod.runtime.online import OnlineError, OnlineResult, run_online
@@ -27,9 +28,9 @@ from velod.runtime.player import player_command
 from velod.runtime.warmup import fill_cache
 from velod.types import NS_PER_S, EventPacket, FlowBatch, Velocity
 from velod.wire import Envelope
-from velod.wire.topics import EVENTS, FLOW
+from velod.wire.topics import DEPTH, EVENTS, FLOW, IMU
 
-HOP = "hop"
+HOP, LATENCY = "hop", "latency"
 
 
 def bench(group: str, json: str | None, size: Size | None = None) -> int:
@@ -41,10 +42,10 @@ def bench(group: str, json: str | None, size: Size | None = None) -> int:
     table = sys.stderr if json == "-" else sys.stdout
     print(_HEADER, file=table)
     results = []
-    for name in (*GROUPS, HOP) if group == "all" else (group,):
-        if name == HOP:
-            results += (hops := hop(size))
-            for result in hops:
+    for name in (*GROUPS, HOP, LATENCY) if group == "all" else (group,):
+        if name in (HOP, LATENCY):
+            results += (several := hop(size) if name == HOP else latency(3.0 * size.dataflow_seconds))
+            for result in several:
                 print(_line(result), file=table, flush=True)
             continue
         for case in cases(name, size, _pipeline):
@@ -134,8 +135,43 @@ def event_latency(seconds: float) -> Result:
     return Result("pipeline.event_to_flow", float(np.median(waited_ns)) / 1e3, None, None, len(waited_ns))
 
 
+def latency(seconds: float) -> list[Result]:
+    """``latency.*``: from a batch's closing to its velocity in real time, with as many events as in corridor-2.
+
+    Medians and p99, by the stamps of the messages: to its flow and to its depth; from the moment when everything is
+    there that the velocity is made of; and in all, with the wait for the next moment of an output. Raises RunFailed,
+    SessionError.
+    """
+    trace = Trace()
+    _through_the_processes(
+        Settings(), seconds, 1.0, speed_px_s=bench_input.CORRIDOR_2_PX_S,
+        on_envelope=trace.note, on_velocity=lambda p: trace.note(Envelope(p.velocity, p.t_pub_ns, p.t_origin_ns)),
+        topics=(FLOW, DEPTH, IMU),
+    )  # fmt: skip
+    legs = trace.legs()
+    if not len(legs[LEGS[0]]):
+        raise RunFailed("no velocity was made of a batch")
+    return [
+        Result(
+            f"latency.{name}",
+            float(np.median(ns)) / 1e3,
+            None,
+            None,
+            len(ns),
+            None,
+            float(np.percentile(ns, 99)) / 1e3,
+        )
+        for name, ns in legs.items()
+    ]
+
+
 def _through_the_processes(
-    settings: Settings, seconds: float, speed: float | None, packets: str = "200hz", **listening: Any
+    settings: Settings,
+    seconds: float,
+    speed: float | None,
+    packets: str = "200hz",
+    speed_px_s: float = bench_input.SPEED_PX_S,
+    **listening: Any,
 ) -> tuple[OnlineResult, int]:
     """Play the benchmark's stream through all processes; what came out, and how many events went in.
 
@@ -145,7 +181,7 @@ def _through_the_processes(
     trouble: list[str] = []
     with TemporaryDirectory() as directory:
         path = Path(directory) / "stream.h5"
-        events = record(path, seconds, seed=1)
+        events = record(path, seconds, seed=1, speed_px_s=speed_px_s)
         driver = player_command(str(path), zenoh, rig.name, speed, packets)
         try:
             result = run_online(
@@ -174,6 +210,8 @@ def _line(r: Result) -> str:
     if r.peer_median_us is not None:
         peer, ratio = _time(r.peer_median_us), f"{r.peer_median_us / r.median_us:.1f}"
     note = r.peer or ("" if r.mev_s is None else f"{r.mev_s:.1f} M events/s, both cameras")
+    if r.p99_us is not None:
+        note = f"p99 {_time(r.p99_us)}"
     return f"{r.name:20s} {_time(r.median_us):>12s} {peer:>12s} {ratio:>8s}  {r.n:4d}  {note}".rstrip()
 
 

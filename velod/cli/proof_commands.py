@@ -8,7 +8,7 @@ import os
 from velod.cli import prove
 from velod.cli.options import Commands, command, plain
 
-_BENCHES = ("all", "flow", "depth", "solve", "codec", "pipeline", "hop")
+_BENCHES = ("all", "flow", "depth", "solve", "codec", "pipeline", "hop", "latency")
 
 
 def add_commands(commands: Commands) -> None:
@@ -26,7 +26,8 @@ def _add_bench(commands: Commands) -> None:
         "On one core, on simulated input, as medians; peers (numpy, OpenCV, pickle) run in the same process. Close\n"
         "what else computes first.",
         "  velod bench                           everything, in about a minute\n"
-        "  velod bench solve --json out.json     the optimizer alone; the numbers into a file",
+        "  velod bench solve --json out.json     the optimizer alone; the numbers into a file\n"
+        "  velod bench latency                   through all processes: where a batch's time goes, p50 and p99",
     )
     parser.add_argument(
         "group", nargs="?", default="all", choices=_BENCHES, metavar="GROUP", help=", ".join(_BENCHES)

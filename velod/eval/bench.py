@@ -51,6 +51,7 @@ class Result:
     peer_median_us: float | None
     n: int
     mev_s: float | None = None
+    p99_us: float | None = None
 
     def row(self) -> dict[str, Any]:
         """The fields of ``velod bench --json``; ratio = peer / ours."""
@@ -63,7 +64,8 @@ class Result:
             "ratio": ratio,
             "n": self.n,
         }
-        return row if self.mev_s is None else {**row, "mev_s": self.mev_s}
+        more = {"mev_s": self.mev_s, "p99_us": self.p99_us}
+        return row | {name: value for name, value in more.items() if value is not None}
 
 
 def measure(case: Case, size: Size) -> Result:
