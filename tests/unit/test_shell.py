@@ -18,11 +18,11 @@ from velod.cli.exit import EXIT_FAILED
 from velod.cli.watch import Way
 from velod.config import Settings
 from velod.runtime.outlet import Outlet
-from velod.runtime.roles import SHELLS
+from velod.runtime.roles import SENSOR_CLOCK_S, SHELLS
 from velod.runtime.shell import WorkerShell
-from velod.types import DepthBatch, Done, EventBatch, FlowBatch, ImuSamples, Message, Velocity
+from velod.types import DepthBatch, Done, EventBatch, FlowBatch, ImuPacket, ImuSamples, Message, Velocity
 from velod.wire import Envelope, decode
-from velod.wire.topics import BATCH_FLOW, DEPTH, DONE, FLOW, HEALTH, IMU, VELOCITY, Topic, key
+from velod.wire.topics import BATCH_FLOW, DEPTH, DONE, FLOW, HEALTH, IMU, IMU_SENSOR, VELOCITY, Topic, key
 
 
 class FakeStage:
@@ -173,6 +173,26 @@ def test_a_velocity_is_as_old_as_its_sample_however_long_that_waited_to_be_handl
         first, second = bench.wait_for(VELOCITY, 2)
     assert first.message.age_ms >= 290.0
     assert second.message.age_ms >= 590.0
+
+
+def test_what_waited_in_ingest_counts_as_age_because_the_sensor_s_own_packets_did_not(session: zenoh.Session) -> None:
+    """All that a new ingest sends is late at first; one packet with a time that cannot be is believed no more."""
+
+    class Moving(FakeStage):
+        time_offset_s = 0.01
+
+    nothing = np.zeros((0, 3))
+    with Bench(session, "optimizer", Moving(lambda m: [replace(velocity(0, 0), t_ns=m.t_ns)])) as bench:
+        for seq, glitch_ns in enumerate((0, 0, 5_000_000_000, 0)):
+            t_ns = time.time_ns() + 10_000_000 + glitch_ns
+            at = np.array([t_ns])
+            bench.outlet.publish(IMU_SENSOR, ImuPacket(seq, t_ns, at, np.zeros((1, 3)), np.zeros((1, 3))))
+            time.sleep(1.2 * SENSOR_CLOCK_S)
+        late_ns = time.time_ns() - 170_000_000
+        late = ImuSamples(0, late_ns, 0, -1, 0, np.zeros(0, np.int64), nothing, nothing)
+        bench.outlet.publish(IMU, late)
+        out, *_ = bench.wait_for(VELOCITY, 1)  # and those of the packets that the bridge had kept
+    assert 160.0 < out.message.age_ms < 1000.0
 
 
 def test_health_tells_counters_gaps_rates_and_alarms(session: zenoh.Session) -> None:

@@ -52,8 +52,9 @@ class SensorClock:
         """Data of sensor time ``t_ns`` had arrived at ``host_ns``."""
         offset_ns = host_ns - t_ns
         if self._offset_ns is not None and offset_ns - self._offset_ns < self._RESTART_NS:
-            allowed_ns = self._offset_ns + int(max(0, t_ns - self._t_ns) * self._DRIFT)
-            offset_ns = min(offset_ns, allowed_ns)
+            # Data that took another way may be of an earlier moment.
+            t_ns = max(t_ns, self._t_ns)
+            offset_ns = min(offset_ns, self._offset_ns + int((t_ns - self._t_ns) * self._DRIFT))
         self._offset_ns, self._t_ns = offset_ns, t_ns
 
     def age_ms(self, t_ns: int, host_ns: int) -> float:

@@ -21,7 +21,18 @@ from velod.runtime.sensor_clock import SensorClockFit
 from velod.runtime.shell import WorkerShell
 from velod.runtime.stages import Inertial, Limited, Reckoning, Stage
 from velod.runtime.succession import Succession, Turn
-from velod.types import DepthBatch, Done, EventBatch, FlowBatch, ImuSamples, Message, Odometry, StereoBatch, Velocity
+from velod.types import (
+    DepthBatch,
+    Done,
+    EventBatch,
+    FlowBatch,
+    ImuPacket,
+    ImuSamples,
+    Message,
+    Odometry,
+    StereoBatch,
+    Velocity,
+)
 from velod.wire import Envelope, decode
 from velod.wire.topics import (
     BATCH_DEPTH,
@@ -41,6 +52,8 @@ from velod.wire.topics import (
 
 OVERTAKING = 64
 """Results of several workers overtake each other by no more than this."""
+SENSOR_CLOCK_S = 0.05
+"""How often the optimizer looks at what time the sensor's own packets come."""
 
 
 class IngestShell(WorkerShell):
@@ -199,6 +212,7 @@ class OptimizerShell(WorkerShell):
         self._origin_ns: dict[tuple[int, int], int] = {}  # by seq and end of the batch
         self._newest = (-1, 0)
         self._clock = SensorClock()
+        self._sensor_heard: tuple[int, int] | None = None  # sensor time of one of its packets, and its arrival
         self._succession: Succession[_Output] = Succession(worker)
         self._odometry_seq = 0
         self._bridge: ImuBridge | None = None
@@ -250,6 +264,7 @@ class OptimizerShell(WorkerShell):
         """What another optimizer has published, resets of the odometry, and the sensor's own IMU packets."""
         if self._bridge is not None and item.source == IMU_SENSOR.name:
             self._bridge.keep(item.data)
+            self._hear_sensor(item)
             return True
         if item.source == ODOMETRY_RESET.name:
             if isinstance(self.stage, Reckoning):
@@ -265,6 +280,19 @@ class OptimizerShell(WorkerShell):
         else:
             self._succession.heard(item.key, message.t_ns, message.seq, time.monotonic())
         return True
+
+    def _hear_sensor(self, item: Item) -> None:
+        """The sensor's own packets do not wait for ingest, which is late for a while after a start."""
+        before = self._sensor_heard
+        if before is not None and 0 <= item.t_ns - before[1] < SENSOR_CLOCK_S * 1e9:
+            return
+        packet = decode(item.data, ImuPacket).message
+        assert isinstance(self.stage, Inertial)
+        t_ns = packet.t_ns - round(self.stage.time_offset_s * 1e9)
+        self._sensor_heard = (t_ns, item.t_ns)
+        if before is not None:
+            # Nobody has checked its times yet: two have to agree before a delay is taken for the least one.
+            self._clock.heard(min(t_ns, before[0] + item.t_ns - before[1]), item.t_ns)
 
     def handle(self, message: Message) -> Sequence[Message]:
         """IMU samples by way of the bridge, which knows what the stage has had already."""
