@@ -13,7 +13,8 @@ demo: $(RUN)
 	$(BIN)/velod demo
 
 test: check
-	$(BIN)/python -m pytest --ignore=tests/bench
+	$(BIN)/python -m pytest --ignore=tests/bench -m "not timed" -n auto --dist loadgroup --no-loadscope-reorder -p no:benchmark
+	$(BIN)/python -m pytest --ignore=tests/bench -m timed
 
 check: $(DEV)
 	$(BIN)/ruff check .

@@ -77,6 +77,7 @@ def test_a_recording_without_a_calibration_is_played_with_the_one_that_is_named(
     assert result["ave_mps"] < 0.5 and result["valid_fraction"] > 0.9
 
 
+@pytest.mark.timed
 def test_the_demo_ends_with_its_error_against_the_truth(
     simulated: Callable[[str, float], Path],
     settings_file: Path,

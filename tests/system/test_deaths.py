@@ -103,6 +103,7 @@ def assert_reported(result: OnlineResult, worker: str, log: pytest.LogCaptureFix
     assert any(worker in r.getMessage() and "killed by SIGKILL" in r.getMessage() for r in log.records)
 
 
+@pytest.mark.timed
 @pytest.mark.parametrize("worker", ["flow-0", "depth-0"])
 def test_killing_a_flow_or_depth_worker_loses_no_batch_and_leaves_no_gap(
     slanted: Path, settings: Settings, worker: str, caplog: pytest.LogCaptureFixture
@@ -117,6 +118,7 @@ def test_killing_a_flow_or_depth_worker_loses_no_batch_and_leaves_no_gap(
     assert result.gaps == 0
 
 
+@pytest.mark.timed
 @pytest.mark.parametrize("worker", ["ingest-0", "optimizer-0"])
 def test_after_the_death_of_ingest_or_the_optimizer_velocity_is_back_within_a_second(
     slanted: Path, settings: Settings, worker: str, caplog: pytest.LogCaptureFixture
@@ -131,6 +133,7 @@ def test_after_the_death_of_ingest_or_the_optimizer_velocity_is_back_within_a_se
     assert np.median([np.linalg.norm(v.v_B - [-3.125, 0.0, 0.0]) for v in last]) < 0.1
 
 
+@pytest.mark.timed
 def test_garbage_and_alien_versions_are_counted_and_the_service_goes_on(slanted: Path, settings: Settings) -> None:
     begun: list[float] = []
     disturb = Disturbance(begun, after_s=1.0)
@@ -178,6 +181,7 @@ def test_garbage_and_alien_versions_are_counted_and_the_service_goes_on(slanted:
     assert longest_gap_s(result) <= 0.1
 
 
+@pytest.mark.timed
 def test_a_worker_that_hangs_is_passed_over_and_loses_no_batch(slanted: Path, settings: Settings) -> None:
     two = replace(settings, flow=FlowSettings(workers=2))
     begun: list[float] = []
@@ -223,6 +227,7 @@ with open_session(ZenohSettings(port=int(sys.argv[1]))) as session:
 """
 
 
+@pytest.mark.timed
 def test_a_stopped_consumer_disturbs_nobody(slanted: Path, settings: Settings) -> None:
     begun: list[float] = []
     stop_it = Disturbance(begun, after_s=1.0)

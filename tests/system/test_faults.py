@@ -27,6 +27,7 @@ HOLE_S = 5.0
 CHATTER = Path(__file__).with_name("chatter.py")
 
 
+@pytest.mark.timed
 def test_what_befalls_one_consumer_is_no_other_s_concern(tmp_path: Path) -> None:
     """One behind 1 % loss, 5 ms and 100 Mbit; two in a black hole for 5 s; one that stops for 10 s; one untouched.
 

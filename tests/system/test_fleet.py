@@ -8,7 +8,7 @@ import pytest
 
 from velod.prove.fleet import run_fleet
 
-pytestmark = pytest.mark.system
+pytestmark = [pytest.mark.system, pytest.mark.timed]
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads CPU times from /proc")

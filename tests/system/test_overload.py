@@ -22,7 +22,7 @@ from velod.types import Health
 from velod.wire import decode
 from velod.wire.topics import HEALTH, key
 
-pytestmark = pytest.mark.system
+pytestmark = [pytest.mark.system, pytest.mark.timed]
 
 SECONDS = 7.0
 MAX_AGE_S = 1.0

@@ -22,6 +22,7 @@ pytestmark = pytest.mark.system
 VELOD = [sys.executable, "-P", "-m", "velod.cli"]
 
 
+@pytest.mark.timed
 def test_the_sensors_and_the_velocity_of_a_replay_are_recorded_whole(port: int, tmp_path: Path) -> None:
     # At half speed: what is shown is that nothing is lost on a machine that can follow.
     slanted = slanted_scene.write(tmp_path / "slanted.h5", 2.5)

@@ -46,6 +46,7 @@ def health(seq: int) -> Health:
     return Health(seq, seq, "flow", "flow-0", 1, "host", "0", 1.0)
 
 
+@pytest.mark.timed
 def test_the_newest_velocity_of_each_rig_goes_up_so_often_and_nothing_else_does(tmp_path: Path) -> None:
     ports = free_ports(4)
     site, top = (f"tls/localhost:{port}" for port in ports[2:])

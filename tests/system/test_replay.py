@@ -62,6 +62,7 @@ def offline(runs: dict[Path, tuple[list[Velocity], Batches]], recording: Path) -
     return runs[recording]
 
 
+@pytest.mark.timed
 @pytest.mark.data
 @pytest.mark.usefixtures("calm")
 def test_events_of_another_simulator_become_velocities_in_real_time(boxes: Path, settings: Settings) -> None:
@@ -95,6 +96,7 @@ def test_lossless_runs_are_the_same_whoever_computes_and_however_packets_are_cut
     assert max(np.abs(a.v_B - b.v_B).max() for a, b in zip(published, velocities, strict=True)) < 1e-9
 
 
+@pytest.mark.timed
 @pytest.mark.usefixtures("calm")
 def test_the_slanted_edges_are_measured_in_real_time(slanted: Path, settings: Settings) -> None:
     result, _ = run(settings, slanted, speed=1.0)

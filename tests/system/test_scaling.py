@@ -14,7 +14,7 @@ from tests import slanted_scene
 from tests.system.hosts import Network, why_not
 from tests.system.rig import Rig, Stalls
 
-pytestmark = [pytest.mark.system, pytest.mark.skipif(bool(why_not()), reason=why_not())]
+pytestmark = [pytest.mark.system, pytest.mark.timed, pytest.mark.skipif(bool(why_not()), reason=why_not())]
 
 
 @pytest.fixture

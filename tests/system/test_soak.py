@@ -10,7 +10,7 @@ import pytest
 
 from velod.prove.soak import soak
 
-pytestmark = pytest.mark.system
+pytestmark = [pytest.mark.system, pytest.mark.timed]
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")

@@ -16,7 +16,7 @@ from tests.system.hosts import Network, why_not
 from tests.system.rig import Rig, Stalls
 from velod.config import OptimizerSettings, Settings
 
-pytestmark = [pytest.mark.system, pytest.mark.skipif(bool(why_not()), reason=why_not())]
+pytestmark = [pytest.mark.system, pytest.mark.timed, pytest.mark.skipif(bool(why_not()), reason=why_not())]
 
 
 SECONDS = 9.0

@@ -17,7 +17,7 @@ from velod.eval.metrics import evaluate
 from velod.runtime.offline import run_offline
 from velod.types import Velocity
 
-pytestmark = [pytest.mark.system, pytest.mark.skipif(bool(why_not()), reason=why_not())]
+pytestmark = [pytest.mark.system, pytest.mark.timed, pytest.mark.skipif(bool(why_not()), reason=why_not())]
 
 
 @pytest.fixture

@@ -131,6 +131,7 @@ def test_a_consumer_of_a_fleet_hears_every_rig_by_one_subscription(keys: Path, t
     assert alone == [("drone-2", 2.0)] * 5
 
 
+@pytest.mark.timed
 def test_over_a_poor_link_only_velocity_goes_and_no_more_often_than_asked_for(keys: Path, tmp_path: Path) -> None:
     files = host("remote", Site(keys=str(keys), rigs=RIGS, max_hz=10.0), tmp_path, *(ports := free_ports(2)))
     endpoint = f"tls/localhost:{ports[1]}"
