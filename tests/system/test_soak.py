@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import sys
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -19,6 +21,7 @@ def test_faults_at_random_leave_nothing_behind(slanted: Path) -> None:
     result = soak(slanted, seconds=60.0, fault_every_s=6.0, seed=1, on_fault=logging.getLogger("soak").info)
     assert result.failures() == []
     assert sum(result.faults.values()) >= 2
+    assert json.loads(json.dumps(asdict(result)))["faults"] == result.faults
     assert {"supervisor", "driver"} <= {p.worker for p in result.processes}
     assert result.longest_gap_s < 3.0
     assert result.served > 60.0 * 75 * 0.7

@@ -147,7 +147,7 @@ def soak(recording: Path, seconds: float, fault_every_s: float, seed: int, on_fa
         killed_s = [hit_s for hit_s, fault in hits if fault.startswith("kill")]
         return Soak(
             elapsed_s,
-            Counter(fault for _, fault in hits),
+            dict(Counter(fault for _, fault in hits)),
             target.n_heard() - served,
             gap.seconds,
             gap_begun_s,
