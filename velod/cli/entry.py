@@ -15,7 +15,7 @@ from velod.runtime.kernel_cache import ensure_cache_directory
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; the exit code. What a user can put right is one line on stderr, never a traceback."""
-    args = _parser().parse_args(argv)
+    args = parser().parse_args(argv)
     command: Callable[[argparse.Namespace], int] = args.command
     ensure_cache_directory()
     try:
@@ -42,8 +42,9 @@ def _one_line(e: Exception) -> str:
     return " ".join(str(e).split()) or type(e).__name__
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = plain(
+def parser() -> argparse.ArgumentParser:
+    """That of all commands."""
+    top = plain(
         argparse.ArgumentParser,
         prog="velod",
         description="Stereo events and an IMU in; metric body-frame velocity with its covariance out.",
@@ -57,8 +58,8 @@ first steps:
   velod echo                         what it says, from another terminal
 `velod COMMAND --help` has worked examples for each command.""",
     )
-    parser.add_argument("--version", action="version", version=f"velod {__version__}")
-    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    top.add_argument("--version", action="version", version=f"velod {__version__}")
+    commands = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for group in (play_commands, service_commands, watch_commands, proof_commands):
         group.add_commands(commands)
-    return parser
+    return top

@@ -35,9 +35,9 @@ def _add_demo(commands: Commands) -> None:
         "against the simulated truth, rate, latency and what was dropped. It takes half a minute on two\n"
         "cores, half of it the simulation, which the next run finds kept. Exits with 1 where the error exceeds\n"
         "0.1 m/s (spins: 0.2 m/s), or velocities are missing or not valid.",
-        "  velod demo                            5 s at 5.7 m/s along the corridor\n"
-        "  velod demo --seconds 20 --csv out.csv longer; every velocity into a file\n"
-        "  velod demo --sequence boxes-4         a room of boxes instead",
+        "  velod demo                              5 s at 5.7 m/s along the corridor\n"
+        "  velod demo --seconds 20 --csv out.csv   longer; every velocity into a file\n"
+        "  velod demo --sequence boxes-4           a room of boxes instead",
     )
     add_config_option(parser)
     parser.add_argument("--seconds", type=seconds, default=5.0, help="of sensor time (default 5)")
