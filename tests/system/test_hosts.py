@@ -87,7 +87,7 @@ def test_all_processes_can_be_clients_of_a_router(slanted: Path, port: int, tmp_
         result = run_online(
             settings,
             open_recording(slanted).calibration,
-            player_command(str(slanted), settings.zenoh, "rig0", speed=2.0),
+            player_command(str(slanted), settings.zenoh, "rig0", speed=1.0),
             on_line=logging.getLogger("workers").info,
             spare=False,
         )

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import signal
+import subprocess
 import sys
 import time
 from dataclasses import replace
@@ -101,6 +103,28 @@ def test_a_process_that_ignores_sigterm_is_killed() -> None:
         time.sleep(0.01)
     stop_all([child], patience_s=0.2)
     assert child.exit_code() == -9
+
+
+OTHERS_TAKE_THE_SIGNAL = """
+import signal, sys, time
+from threading import Thread
+from velod.runtime.worker import stop_on_signals
+Thread(target=time.sleep, args=(60.0,), daemon=True).start()  # as the network's threads are: takes any signal
+signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM, signal.SIGINT})
+stop = stop_on_signals()
+print("waits", file=sys.stderr, flush=True)
+sys.exit(0 if stop.wait(50.0) else 3)
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_that_another_thread_takes_ends_the_wait_of_the_main_thread(number: int) -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", OTHERS_TAKE_THE_SIGNAL], stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stderr is not None and process.stderr.readline() == "waits\n"
+        process.send_signal(number)
+        assert process.wait(20.0) == 0
 
 
 def test_kernels_are_cached_elsewhere_only_where_nothing_else_can_be_written(monkeypatch: pytest.MonkeyPatch) -> None:

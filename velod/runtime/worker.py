@@ -8,9 +8,10 @@ import gc
 import logging
 import os
 import signal
+import socket
 import sys
 from collections.abc import Sequence
-from threading import Event
+from threading import Event, Thread
 
 import zenoh
 
@@ -145,8 +146,23 @@ def keep_memory() -> None:
 
 
 def stop_on_signals() -> Event:
-    """An event that SIGTERM and SIGINT set."""
+    """An event that SIGTERM and SIGINT set, at once, whatever the main thread waits for.
+
+    The kernel may give a signal to one of the network's threads. Python runs handlers in the main thread alone, and
+    nothing wakes that from a wait: the service would go on until its wait is over.
+    """
     stop = Event()
+    told, tells = socket.socketpair()
+    tells.setblocking(False)
+    signal.set_wakeup_fd(tells.detach(), warn_on_full_buffer=False)
     for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stop.set())
+        signal.signal(number, lambda *_: None)
+    Thread(target=_set_when_told, args=(stop, told), name="signals", daemon=True).start()
     return stop
+
+
+def _set_when_told(stop: Event, told: socket.socket) -> None:
+    with told:
+        while told.recv(1)[0] not in (signal.SIGTERM, signal.SIGINT):
+            pass  # of another signal that has a handler
+    stop.set()
