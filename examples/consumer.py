@@ -5,6 +5,7 @@
 The same in any language that has Zenoh and msgpack; docs/messages.md describes every message.
 """
 
+import contextlib
 import json
 import struct
 import sys
@@ -27,6 +28,7 @@ config = zenoh.Config.from_json5(
 
 # The ring keeps the newest messages: a slow consumer loses old ones instead of being served them late.
 with (
+    contextlib.suppress(KeyboardInterrupt),
     zenoh.open(config) as session,
     session.declare_subscriber("velod/rig0/velocity", zenoh.handlers.RingChannel(8)) as subscriber,
 ):

@@ -21,11 +21,12 @@ RIG = "rig0"
 PERIOD_NS = 5_000_000  # a packet every 5 ms of sensor time
 NOISE = np.random.default_rng(1)
 
-# When an edge first reaches each pixel; the next one follows 64 px or 0.64 s behind. They lean to the right in the
-# upper half of the image and to the left in the lower half: edges of one direction would show motion across it only.
+# When an edge reaches each pixel; the next one follows 64 px or 0.64 s behind. They lean to the right in the upper
+# half of the image and to the left in the lower half: edges of one direction would show motion across it only.
 ROW, COLUMN = np.mgrid[:260, :346]
 EDGE_PERIOD_NS = 640_000_000
-REACHED_NS = ((COLUMN + np.where(ROW < 130, 0.5, -0.5) * ROW) * 10e6).astype(np.int64)
+REACHED_NS = (((COLUMN + np.where(ROW < 130, 0.5, -0.5) * ROW) * 10e6).astype(np.int64) % EDGE_PERIOD_NS).ravel()
+ORDER = np.argsort(REACHED_NS, kind="stable")
 DISPARITY_NS = {"left": 0, "right": 80_000_000}
 
 
@@ -69,11 +70,12 @@ def imu_packet(seq, t_ns, accel, gyro):
 
 def read_camera(camera, start_ns, end_ns):
     """Stands for your SDK: the events of start_ns <= t < end_ns."""
-    wait_ns = (REACHED_NS + DISPARITY_NS[camera] - start_ns) % EDGE_PERIOD_NS
-    y, x = np.nonzero(wait_ns < end_ns - start_ns)
-    t_ns = start_ns + wait_ns[y, x]
-    order = np.argsort(t_ns, kind="stable")
-    return t_ns[order], x[order], y[order], np.ones(len(order))
+    # A packet never reaches over the end of a period, which is a whole number of packets long.
+    phase_ns = (start_ns - DISPARITY_NS[camera]) % EDGE_PERIOD_NS
+    first, last = np.searchsorted(REACHED_NS, [phase_ns, phase_ns + end_ns - start_ns], sorter=ORDER)
+    pixels = ORDER[first:last]
+    y, x = np.divmod(pixels, COLUMN.shape[1])
+    return start_ns + REACHED_NS[pixels] - phase_ns, x, y, np.ones(len(pixels))
 
 
 def read_imu(start_ns):

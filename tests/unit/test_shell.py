@@ -228,8 +228,18 @@ def test_a_query_resets_the_odometry_of_every_optimizer_that_hears_it(
         def reset_odometry(self) -> None:
             self.resets += 1
 
+    class Young:
+        """A session that was just opened: it does not know yet who answers."""
+
+        asked = 0
+
+        def get(self, *args: Any, **kwargs: Any) -> Any:
+            self.asked += 1
+            return session.get(*args, **kwargs) if self.asked > 2 else []
+
     stage = Reckoner(lambda message: [])
-    monkeypatch.setattr(watch, "open_session", lambda settings: nullcontext(session))
+    monkeypatch.setattr(watch, "open_session", lambda settings: nullcontext(Young()))
+    monkeypatch.setattr(watch, "_DISCOVERY_S", 0.5)
     with Bench(session, "optimizer", stage):
         assert watch.reset_odometry(None, Way()) == 0
         deadline_s = time.monotonic() + 5.0

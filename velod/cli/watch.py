@@ -87,9 +87,14 @@ def echo(config: str | None, topic: str, way: Way, count: int | None, timeout_s:
 def reset_odometry(config: str | None, way: Way) -> int:
     """Ask the optimizers to begin their dead reckoning anew; 1 if none answers."""
     place = place_of(config, way, "operator")
+    deadline_s = time.monotonic() + _DISCOVERY_S
+    done: list[str] = []
     with open_session(place.zenoh) as session:
-        replies = session.get(key(ODOMETRY_RESET, place.rig), timeout=_DISCOVERY_S)
-        done = [json.loads(reply.ok.payload.to_string())["reset_by"] for reply in replies if reply.ok is not None]
+        # A session that was just opened may not be linked to the optimizers yet; nobody answers it then.
+        while not done and time.monotonic() < deadline_s:
+            replies = session.get(key(ODOMETRY_RESET, place.rig), timeout=_DISCOVERY_S)
+            done = [json.loads(reply.ok.payload.to_string())["reset_by"] for reply in replies if reply.ok is not None]
+            time.sleep(0.0 if done else 0.02)
     if not done:
         print(f"velod: no optimizer of rig {place.rig} answers ({place.connect})", file=sys.stderr)
         return EXIT_FAILED
