@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -73,3 +74,13 @@ def test_the_container_is_built_from_files_that_exist_and_are_sent() -> None:
     sent = {line[1:] for line in (ROOT / ".dockerignore").read_text("utf-8").splitlines() if line.startswith("!")}
     assert set(copied) == sent
     assert all((ROOT / name).exists() for name in copied)
+
+
+def test_the_wheel_gets_every_package_and_the_source_distribution_what_make_test_needs() -> None:
+    setuptools = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["setuptools"]
+    folders = [path.parent for path in (ROOT / "velod").rglob("__init__.py")]
+    found = {".".join(folder.relative_to(ROOT).parts) for folder in folders}
+    assert set(setuptools["packages"]) == found | {"velod.workers", "velod.schemas"}
+    assert (ROOT / "velod" / "py.typed").exists() and "py.typed" in setuptools["package-data"]["velod"]
+    taken = re.findall(r"^(?:include|graft) (.+)", (ROOT / "MANIFEST.in").read_text("utf-8"), re.M)
+    assert {"Makefile", "constraints.txt", "deploy", "docs", "examples", "tests"} <= set(" ".join(taken).split())
