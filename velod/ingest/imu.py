@@ -5,14 +5,18 @@ from __future__ import annotations
 from collections import Counter
 
 import numpy as np
+from numba import njit
 
 from velod.config import IngestSettings
+from velod.events.columns import readonly
 from velod.events.sae import NEVER
 from velod.ingest.imu_units import ImuUnits
 from velod.ingest.ordering import PacketOrder
 from velod.types import F64, I64, NS_PER_S, ImuPacket
 
 FROZEN, UNITS = "imu.frozen", "imu.units"
+DROPS = ("imu.nan", "imu.backwards", FROZEN)
+_NAN, _BACKWARDS, _FROZEN = range(3)
 
 
 class ImuStream:
@@ -42,35 +46,70 @@ class ImuStream:
 
     def accept(self, packet: ImuPacket) -> tuple[I64, F64, F64]:
         """Good samples of the packet: times on the camera's clock (t_imu - time_offset, Kalibr), accel, gyro."""
-        value = np.hstack([packet.accel, packet.gyro])
-        finite = np.isfinite(value.sum(axis=1))
-        kept = [i for i in range(len(value)) if self._is_good(int(packet.sample_t_ns[i]), value[i], bool(finite[i]))]
-        t_ns, accel, gyro = packet.sample_t_ns[kept] - self._offset_ns, packet.accel[kept], packet.gyro[kept]
-        if kept:
+        n = len(packet.sample_t_ns)
+        kept, dropped = np.empty(n, np.int64), np.zeros(len(DROPS), np.int64)
+        n, self._last_ns, self._identical = _check(
+            readonly(packet.sample_t_ns, np.int64), readonly(packet.accel, np.float64),
+            readonly(packet.gyro, np.float64),
+            self._max_frozen, self._last_ns, self._identical, self._last_value, kept, dropped,
+        )  # fmt: skip
+        for cause, count in zip(DROPS, dropped.tolist(), strict=True):
+            if count:
+                self._counters[cause] += count
+        good = kept[:n]
+        t_ns, accel, gyro = packet.sample_t_ns[good] - self._offset_ns, packet.accel[good], packet.gyro[good]
+        if n:
             self.t_ns = int(t_ns[-1])
-        self._doubt_units(t_ns, accel, gyro)
+        self._doubt(t_ns, accel, gyro)
         return t_ns, accel, gyro
 
-    def _doubt_units(self, t_ns: I64, accel: F64, gyro: F64) -> None:
+    def _doubt(self, t_ns: I64, accel: F64, gyro: F64) -> None:
         self._units.add(t_ns, accel, gyro)
-        if self._units.alarm:
-            self._alarms[UNITS] = self._units.alarm
-        else:
-            self._alarms.pop(UNITS, None)
+        frozen = f"the IMU has repeated one sample {self._identical} times"
+        for name, alarm in (
+            (UNITS, self._units.alarm),
+            (FROZEN, frozen if self._identical > self._max_frozen else ""),
+        ):
+            if alarm:
+                self._alarms[name] = alarm
+            else:
+                self._alarms.pop(name, None)
 
-    def _is_good(self, t_ns: int, value: F64, finite: bool) -> bool:
-        if not finite:
-            self._counters["imu.nan"] += 1
-            return False
-        if t_ns <= self._last_ns:
-            self._counters["imu.backwards"] += 1
-            return False
-        self._last_ns = t_ns
-        self._identical = self._identical + 1 if np.array_equal(value, self._last_value) else 1
-        self._last_value = value
-        if self._identical > self._max_frozen:
-            self._counters[FROZEN] += 1
-            self._alarms[FROZEN] = f"the IMU has repeated one sample {self._identical} times"
-            return False
-        self._alarms.pop(FROZEN, None)
-        return True
+
+@njit(cache=True, nogil=True)
+def _check(
+    t_ns: I64,
+    accel: F64,
+    gyro: F64,
+    max_frozen: int,
+    last_ns: int,
+    identical: int,
+    last_value: F64,
+    kept: I64,
+    dropped: I64,
+) -> tuple[int, int, int]:
+    """Writes which samples are good to ``kept`` (n,), and counts the others in ``dropped`` by cause.
+
+    ``last_value`` (6,) of the newest sample before, at ``last_ns``, which came ``identical`` times; it is renewed.
+    Returns how many are good, and both of the newest sample now.
+    """
+    n = 0
+    for i in range(t_ns.size):
+        if not np.isfinite(accel[i].sum() + gyro[i].sum()):
+            dropped[_NAN] += 1
+            continue
+        if t_ns[i] <= last_ns:
+            dropped[_BACKWARDS] += 1
+            continue
+        last_ns = t_ns[i]
+        same = True
+        for j in range(3):
+            same &= accel[i, j] == last_value[j] and gyro[i, j] == last_value[3 + j]
+            last_value[j], last_value[3 + j] = accel[i, j], gyro[i, j]
+        identical = identical + 1 if same else 1
+        if identical > max_frozen:
+            dropped[_FROZEN] += 1
+            continue
+        kept[n] = i
+        n += 1
+    return n, last_ns, identical

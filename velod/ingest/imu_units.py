@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-import numpy as np
+import math
+
+from numba import njit
 
 from velod.types import F64, I64, NS_PER_S
 
@@ -30,8 +32,8 @@ class ImuUnits:
         if self._n == 0:
             self._since_ns = int(t_ns[0])
         self._n += len(t_ns)
-        self._accel += float(np.linalg.norm(accel, axis=1).sum())
-        self._gyro += float(np.linalg.norm(gyro, axis=1).sum())
+        self._accel += _sum_of_norms(accel)
+        self._gyro += _sum_of_norms(gyro)
         if int(t_ns[-1]) - self._since_ns >= PERIOD_NS:
             self.alarm = _doubt(self._accel / self._n, self._gyro / self._n)
             self._begin()
@@ -43,3 +45,11 @@ def _doubt(accel: float, gyro: float) -> str:
     if gyro > MOST_RAD_S:
         return f"the gyroscope reads {gyro:.0f} rad/s over a second: is it in degrees?"
     return ""
+
+
+@njit(cache=True, nogil=True)
+def _sum_of_norms(rows: F64) -> float:
+    total = 0.0
+    for i in range(len(rows)):
+        total += math.sqrt(rows[i, 0] ** 2 + rows[i, 1] ** 2 + rows[i, 2] ** 2)
+    return total
