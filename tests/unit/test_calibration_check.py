@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tests import synthetic
-from velod.config import OptimizerSettings, Settings
+from velod.config import ImuSettings, OptimizerSettings, Settings
 from velod.depth.stage import DepthStage
 from velod.flow.stage import FlowStage
 from velod.geometry.calibration import Calibration
@@ -18,10 +18,10 @@ from velod.geometry.rectify import rectify
 from velod.ingest.stage import IngestStage
 from velod.io import open_recording
 from velod.optimizer.calibration_check import CLOCK, EVERY, ROWS, SCALE, CalibrationCheck
-from velod.optimizer.scale_check import SPAN_S, ScaleCheck
+from velod.optimizer.scale_check import SPAN_S, ScaleCheck, noise_of_span
 from velod.optimizer.stage import OptimizerStage
 from velod.optimizer.stereo_check import MIN_BATCHES, MOTION_SHARE, NEAR_PX, StereoCheck, _neighbours, _robust_sums
-from velod.types import DepthBatch, EventBatch, EventPacket, FlowBatch, StereoBatch
+from velod.types import F64, DepthBatch, EventBatch, EventPacket, FlowBatch, StereoBatch
 
 CAMERA = (260.0, 173.0, 130.0)
 DATA = Path(__file__).parents[3] / "shared" / "data"
@@ -148,7 +148,7 @@ def front_end(path: Path, late_ns: int = 0, calibration: Calibration | None = No
     """The check over a whole recording, whose right camera is ``late_ns`` late."""
     recording = open_recording(path, calibration=calibration)
     ingest, flow, depth = (s(Settings(), recording.calibration) for s in (IngestStage, FlowStage, DepthStage))
-    check = CalibrationCheck(OptimizerSettings(), camera_of(recording.calibration))
+    check = CalibrationCheck(OptimizerSettings(), ImuSettings(), camera_of(recording.calibration))
     flows: list[FlowBatch] = []
     depths: list[DepthBatch] = []
     for packet in recording.packets():
@@ -203,7 +203,7 @@ def test_a_principal_point_that_is_a_pixel_off_raises_an_alarm() -> None:
 def scale_of(error: float, bend_m_s: float, seconds: float = 20.0) -> ScaleCheck:
     """Velocities that swing by ``bend_m_s``, gravity's line in their integral, and noise on the batches."""
     rng = np.random.default_rng(3)
-    check = ScaleCheck()
+    check = ScaleCheck(ImuSettings())
     for t in np.arange(0.0, seconds, 0.02):
         v = np.array([3.0, 0.5, 1.0]) + bend_m_s * np.sin(np.array([2.0, 2.7, 1.3]) * t)
         s_L = v + np.array([0.4, 9.7, 1.0]) * t + 7.0
@@ -225,8 +225,39 @@ def test_uniform_motion_says_little_of_the_scale() -> None:
     assert scale.sigma > 0.1 or abs(scale.error) < 3 * scale.sigma
 
 
+def integrated_noise(rng: np.random.Generator, imu: ImuSettings, n: int, period_s: float) -> F64:
+    """s_L (n, 3) of an IMU that moves evenly: its accelerometer's noise, and gravity along a tilt that walks."""
+    accel, gyro = (
+        rng.normal(0.0, density / np.sqrt(period_s), (n, 3)) for density in (imu.accel_noise, imu.gyro_noise)
+    )
+    tilt = np.cumsum(gyro, axis=0)[:, [1, 0, 2]] * period_s
+    return np.cumsum(accel + imu.gravity * tilt * [1.0, -1.0, 0.0], axis=0) * period_s
+
+
+def test_the_noise_of_the_imu_alone_swings_as_much_as_is_reckoned_with() -> None:
+    rng, found = np.random.default_rng(5), []
+    t = np.arange(0.0, SPAN_S, 0.01)
+    for _ in range(400):
+        s = integrated_noise(rng, ImuSettings(accel_bias_walk=1e-9), len(t), 0.01)
+        line = np.polynomial.polynomial.polyfit(t, s, 1)
+        found.append(((s - np.polynomial.polynomial.polyval(t, line).T) ** 2).sum(axis=1).mean())
+    assert np.mean(found) == pytest.approx(noise_of_span(ImuSettings(accel_bias_walk=1e-9)), rel=0.1)
+
+
+@pytest.mark.parametrize("share", [0.1, 1.0])
+def test_even_motion_under_an_imu_as_noisy_as_it_says_or_less_is_no_wrong_baseline(share: float) -> None:
+    imu, rng = ImuSettings(), np.random.default_rng(4)
+    quieter = replace(imu, accel_noise=share * imu.accel_noise, gyro_noise=share * imu.gyro_noise)
+    check = ScaleCheck(imu)
+    for k, s_L in enumerate(integrated_noise(rng, quieter, 2000, 0.02)):
+        check.add(20_000_000 * k, s_L, np.array([1.25, 0.0, 0.0]) - s_L + rng.normal(0.0, 0.01, 3))
+    scale = check.scale()
+    assert scale is not None
+    assert abs(scale.error) < 3 * scale.sigma
+
+
 def test_a_hole_or_a_new_count_of_the_integral_begins_a_new_span() -> None:
-    check = ScaleCheck()
+    check = ScaleCheck(ImuSettings())
     for k in range(int(3 * SPAN_S / 0.02)):
         jump = 100.0 * (k // 60)
         check.add(20_000_000 * k, np.full(3, jump), np.zeros(3))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from velod.config import OptimizerSettings
+from velod.config import ImuSettings, OptimizerSettings
 from velod.optimizer.depth_share import DepthShare
 from velod.optimizer.rotation_check import Offsets
 from velod.optimizer.scale_check import ScaleCheck
@@ -24,7 +24,7 @@ IMU_CLOCK, IMU_ROTATION = "calibration.imu_clock", "calibration.imu_rotation"
 class CalibrationCheck:
     """``gauges`` and ``alarms`` are kept up to date; a value that the motion does not show is missing."""
 
-    def __init__(self, settings: OptimizerSettings, camera: tuple[float, float, float]) -> None:
+    def __init__(self, settings: OptimizerSettings, imu: ImuSettings, camera: tuple[float, float, float]) -> None:
         """``camera``: f, cx, cy of the rectified left image, px."""
         self.gauges: dict[str, float] = {}
         self.alarms: dict[str, str] = {}
@@ -35,7 +35,7 @@ class CalibrationCheck:
             IMU_CLOCK: settings.alarm_imu_clock_ms,
             IMU_ROTATION: settings.alarm_imu_rotation_deg,
         }
-        self._stereo, self._scale, self._depths = StereoCheck(camera), ScaleCheck(), DepthShare()
+        self._stereo, self._scale, self._depths = StereoCheck(camera), ScaleCheck(imu), DepthShare()
         self._offsets: Offsets | None = None
         self._turn = 0
 
@@ -65,6 +65,10 @@ class CalibrationCheck:
             self._judge(
                 SCALE, "percent", percent, "the cameras' scale is {:+.2f} +- {:.2f} % off the IMU's: baseline?"
             )
+
+    def use_noise(self, imu: ImuSettings) -> None:
+        """The IMU's noise as it shows by now."""
+        self._scale.imu = imu
 
     def add_offsets(self, offsets: Offsets) -> None:
         """The newest of the events against the IMU; the same again says nothing new."""

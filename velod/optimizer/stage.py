@@ -83,7 +83,7 @@ class OptimizerStage:
         self._closed_seq = -1  # newest batch that ingest has closed
         self._unchecked: list[_Unchecked] = []  # against the calibration
         self._reset()
-        self._check = CalibrationCheck(settings.optimizer, self._estimator.camera)
+        self._check = CalibrationCheck(settings.optimizer, settings.imu, self._estimator.camera)
         self.alarms, self.gauges = self._check.alarms, self._check.gauges
 
     def _reset(self) -> None:
@@ -313,9 +313,10 @@ class OptimizerStage:
         self._unchecked.clear()
 
     def _check_noise(self) -> None:
-        """The IMU's noise as it shows, in the dead reckoning too; an alarm where it is far from the settings."""
+        """The IMU's noise as it shows, for all who reckon with it; an alarm where it is far from the settings."""
         noise = self._estimator.imu_noise
         self._reckoning.gyro_noise = noise.settings.gyro_noise
+        self._check.use_noise(noise.settings)
         accel, gyro = noise.excess
         self.alarms.pop(NOISE, None)
         if max(accel, gyro) > ALARM_NOISE:
