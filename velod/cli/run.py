@@ -48,6 +48,7 @@ def run(
 
 def warmup() -> int:
     """Compile and cache the kernels of all stages and of the simulator."""
+    from velod.runtime.kernel_cache import confirm_kernels
     from velod.runtime.warmup import fill_cache
     from velod.sim import sequence, simulate
 
@@ -55,5 +56,6 @@ def warmup() -> int:
     fill_cache(Settings())
     with tempfile.TemporaryDirectory() as directory:
         simulate(sequence("corridor-1"), 0.01, 1, Path(directory) / "warmup.h5")
+    confirm_kernels()
     print(f"kernels ready after {time.monotonic() - start_s:.1f} s")
     return 0

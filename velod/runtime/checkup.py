@@ -11,7 +11,6 @@ import socket
 import sys
 from dataclasses import dataclass
 from importlib import metadata
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
 
@@ -20,7 +19,7 @@ from velod.events.sensor_size import max_disparity_px
 from velod.geometry.calibration import Calibration, CalibrationError, Camera, load_calibration
 from velod.runtime.access import ROLES, SERVER
 from velod.runtime.endpoints import SessionError
-from velod.runtime.kernel_cache import ensure_cache_directory
+from velod.runtime.kernel_cache import cache_directory, ensure_cache_directory, kept_kernels, package_directory
 from velod.runtime.session import open_session
 from velod.runtime.settings_service import fetch
 
@@ -96,13 +95,13 @@ def _is_installed(name: str) -> bool:
 def kernels() -> Finding:
     """Whether numba can keep what it compiles, and has."""
     ensure_cache_directory()
-    spec = find_spec("velod")
-    package = Path(spec.origin).parent if spec is not None and spec.origin else Path()
-    cache = Path(os.environ.get("NUMBA_CACHE_DIR", package))
+    cache = cache_directory()
     if not os.access(cache, os.W_OK):
         return Finding("kernels", "FAIL", f"{cache} cannot be written to", "set NUMBA_CACHE_DIR to a folder that can")
-    compiled = {path.name.partition(".")[0]: path.stat().st_mtime for path in cache.rglob("*.nbi")}
-    changed = [p.stem for p in package.rglob("*.py") if p.stat().st_mtime > compiled.get(p.stem, math.inf)]
+    compiled = {path.name.partition(".")[0]: path.stat().st_mtime for path in kept_kernels()}
+    changed = [
+        p.stem for p in package_directory().rglob("*.py") if p.stat().st_mtime > compiled.get(p.stem, math.inf)
+    ]
     if changed or not compiled:
         what = f"older than their source: {', '.join(sorted(changed))}" if changed else "not compiled yet"
         return Finding("kernels", "WARN", what, "velod warmup, once; otherwise the first run waits for them")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import tempfile
 from importlib.util import find_spec
@@ -12,10 +13,31 @@ def ensure_cache_directory() -> None:
     """Set NUMBA_CACHE_DIR where numba would find no place of its own to write to. Call before numba is imported."""
     if "NUMBA_CACHE_DIR" in os.environ:
         return
-    spec = find_spec("velod")
-    package = Path(spec.origin).parent if spec is not None and spec.origin else Path()
-    if not (os.access(package, os.W_OK) or os.access(Path.home(), os.W_OK)):
+    if not (os.access(package_directory(), os.W_OK) or os.access(Path.home(), os.W_OK)):
         os.environ["NUMBA_CACHE_DIR"] = str(own_directory(Path(tempfile.gettempdir())))
+
+
+def cache_directory() -> Path:
+    """Where the kernels are kept: NUMBA_CACHE_DIR, or beside the package's own files."""
+    return Path(os.environ.get("NUMBA_CACHE_DIR", package_directory()))
+
+
+def kept_kernels() -> list[Path]:
+    """The index files of numba, one for each kernel; younger than its source where that has not changed since."""
+    return list(cache_directory().rglob("*.nbi"))
+
+
+def confirm_kernels() -> None:
+    """Note that all were just loaded: numba goes by what a source holds, and keeps them when only its date is new."""
+    for path in kept_kernels():
+        with contextlib.suppress(OSError):  # of another user, or gone
+            path.touch()
+
+
+def package_directory() -> Path:
+    """Of velod's own files."""
+    spec = find_spec("velod")
+    return Path(spec.origin).parent if spec is not None and spec.origin else Path()
 
 
 def own_directory(folder: Path) -> Path:
