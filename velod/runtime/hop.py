@@ -1,7 +1,10 @@
 """What one hop between two processes costs: velod beside raw Zenoh and a plain Unix socket, in the same run.
 
-``measure`` sends the same bytes in turn by each way to a process of this module, which notes when it has them: raw
-as bytes, velod's as a checked message in the hands of a stage. Both processes are on one host, so one clock serves.
+``measure`` sends the same bytes by each way to a process of this module, which notes when it has them: raw as bytes,
+velod's as a checked message in the hands of a stage. Raw Zenoh goes through the same sessions with the same settings.
+The ways take turns in runs of messages, because a stage handles one kind all the time, 100 to 500 a second: each
+message by another way would find the code of its own gone from the caches. Both processes are on one host, so one
+clock serves.
 """
 
 from __future__ import annotations
@@ -35,7 +38,7 @@ from velod.wire.topics import EVENTS, Topic
 WAYS = ("velod", "zenoh", "socket")
 _RAW_KEY = "hop/raw"
 _PAUSE_S = 0.005  # between two messages, so that none waits for another
-_WARM = 20  # first ones of each way do not count
+_RUN = 20  # messages by one way, then as many by the next; the first run of each does not count
 _READY, _TOOK = "ready", "took "
 _LENGTH, _TIME = struct.Struct("<I"), struct.Struct("<q")
 
@@ -65,26 +68,34 @@ def measure(packet: EventPacket, n: int, port: int) -> dict[str, float]:
         raw = session.declare_publisher(_RAW_KEY, congestion_control=zenoh.CongestionControl.DROP)
         if not outlet.wait_for_subscriber(EVENTS, 10.0, camera=packet.camera):
             raise TimeoutError("the other end of the hop does not listen")
-        _send(packet, n + _WARM, outlet, raw, plain)
+        _send(packet, 1 + -(-n // _RUN), outlet, raw, plain)
         plain.shutdown(socket.SHUT_WR)
         if not child.wait(10.0):
             raise TimeoutError("the other end of the hop does not end")
         child.why()  # reads its last line
-    return {way: float(np.median(took[0][way][_WARM:])) * 1e-3 for way in WAYS}
+    return {way: float(np.median(took[0][way][_RUN:])) * 1e-3 for way in WAYS}
 
 
-def _send(packet: EventPacket, n: int, outlet: Outlet, raw: Any, plain: socket.socket) -> None:
+def _send(packet: EventPacket, runs: int, outlet: Outlet, raw: Any, plain: socket.socket) -> None:
     body = bytearray(encode(packet, 0))
-    for _ in range(n):
-        time.sleep(_PAUSE_S)
+
+    def by_velod() -> None:
         outlet.publish(EVENTS, packet, camera=packet.camera)
-        time.sleep(_PAUSE_S)
+
+    def by_zenoh() -> None:
         _TIME.pack_into(body, 0, time.time_ns())
         raw.put(body)
-        time.sleep(_PAUSE_S)
+
+    def by_socket() -> None:
         _TIME.pack_into(body, 0, time.time_ns())
         plain.sendall(_LENGTH.pack(len(body)))
         plain.sendall(body)
+
+    for _ in range(runs):
+        for send in (by_velod, by_zenoh, by_socket):
+            for _ in range(_RUN):
+                time.sleep(_PAUSE_S)
+                send()
 
 
 class _Stage:
