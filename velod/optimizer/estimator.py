@@ -10,7 +10,7 @@ import numpy as np
 from velod.config import ImuSettings, Settings
 from velod.events.sensor_size import for_sensor
 from velod.geometry.calibration import Calibration
-from velod.geometry.rectify import rectify
+from velod.geometry.rectify import rectified_pair
 from velod.optimizer import attitude, degeneracy, flow_equation, inertial_residual, overlap
 from velod.optimizer.attitude import Attitude
 from velod.optimizer.consistency import Consistency
@@ -89,7 +89,7 @@ class Estimator:
     ) -> None:
         """``rotation_check``: that of the estimator before, of the same rig."""
         o = settings.optimizer
-        rect = rectify(calibration)
+        rect = rectified_pair(calibration)
         ingest = for_sensor(settings, calibration.left.width, calibration.left.height).ingest
         self._o, self._ingest = o, ingest
         self.imu_noise = ImuNoise(settings.imu)

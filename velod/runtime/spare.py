@@ -4,6 +4,8 @@ It reads one line of JSON from stdin, ``{"become": "flow-0"}``. A fresh process 
 load kernels; the spare is at work in a fraction of one. What it loads, it loads in threads of low priority (Linux
 keeps a niceness per thread), so as not to slow the workers; the main thread, which will be a worker, only waits.
 For the same reason this module imports the standard library and next to nothing of velod at first.
+
+A stage's further workers start in the same way, beside those that work already: told with ``--worker`` at once.
 """
 
 from __future__ import annotations
@@ -28,7 +30,8 @@ if TYPE_CHECKING:
     from velod.runtime.stages import Stage
 
 READY = "ready"
-_NICENESS = 19
+_NICENESS, _WANTED_NICENESS = 19, 10
+"""Of what waits to be needed; of what is."""
 _POLL_S = 0.1
 
 T = TypeVar("T")
@@ -36,8 +39,11 @@ T = TypeVar("T")
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Wait, then be a worker; returns the exit code."""
-    _die_with_supervisor(argv)
-    quietly(_import_all)
+    known = _first_look(argv)
+    with suppress(OSError):  # it is said later, with a log
+        die_with(known.parent)
+    niceness = _WANTED_NICENESS if known.worker else _NICENESS
+    quietly(_import_all, niceness)
     from velod.runtime import worker
     from velod.runtime.session import open_session
     from velod.runtime.settings_service import fetch
@@ -51,9 +57,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         stop = worker.stop_on_signals()
         with open_session(worker.zenoh_settings(args)) as session:
             settings, calibration = fetch(session, args.rig, args.connect)
-            stages = quietly(lambda: _load(settings, calibration, args.stages.split(",")))
+            stages = quietly(lambda: _load(settings, calibration, args.stages.split(",")), niceness)
             print(READY, flush=True)
-            name = _wait_for_order(stop)
+            name = args.worker or _wait_for_order(stop)
             if name:
                 worker.start_logging(name)
                 worker.serve_stage(session, settings, name, stages[stage_of(name)], stop)
@@ -63,22 +69,22 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _die_with_supervisor(argv: Sequence[str] | None) -> None:
-    """At once: what follows may take seconds, and a supervisor that dies meanwhile leaves nothing."""
+def _first_look(argv: Sequence[str] | None) -> argparse.Namespace:
+    """Whom to die with, from now on: what follows may take seconds; and whether it is to be a worker at once."""
     parser = argparse.ArgumentParser(add_help=False)
     parser.add_argument("--parent", type=int, default=0)
-    with suppress(OSError):  # it is said later, with a log
-        die_with(parser.parse_known_args(argv)[0].parent)
+    parser.add_argument("--worker", default="")
+    return parser.parse_known_args(argv)[0]
 
 
-def quietly(work: Callable[[], T]) -> T:
+def quietly(work: Callable[[], T], niceness: int = _NICENESS) -> T:
     """The result of ``work``, done in a thread of low priority. Raises what it raised."""
     results: list[T] = []
     failures: list[BaseException] = []
 
     def run() -> None:
         if sys.platform == "linux":
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICENESS)
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), niceness)
         try:
             results.append(work())
         except BaseException as e:

@@ -40,7 +40,8 @@ FIRST_DELAY_S, LAST_DELAY_S = 0.1, 10.0
 STEADY_S = 10.0
 """A worker that lived so long starts with no delay again."""
 HEAD_START_S = 10.0
-"""So long at the most do a stage's further workers wait for the first of each: all at once, all would come late."""
+"""So long at the most do a stage's further workers wait for the first of each: all at once, all would come late.
+Then they load with low priority, or those that work already could not keep up meanwhile."""
 REMEMBERED_S = 60.0
 """A death stays an alarm in health for so long."""
 
@@ -50,6 +51,7 @@ class _Slot:
     """A worker that is to be there, and the process that is it now."""
 
     worker: str
+    is_further: bool = False  # of its stage, so that others work while it starts for the first time
     process: ChildProcess | None = None
     restarts: int = 0
     quick_deaths: int = 0  # in a row, each soon after its start
@@ -108,8 +110,8 @@ class Supervisor(Stacked):
         stack.enter_context(prime.listen(self.session, self._settings.rig.name))
         stack.callback(self.stop_workers)
         for name in self._names():
-            self._slots[name] = slot = _Slot(name)
-            if any(stage_of(name) == stage_of(other) for other in self._slots if other != name):
+            self._slots[name] = slot = _Slot(name, stage_of(name) in map(stage_of, self._slots))
+            if slot.is_further:
                 slot.due_s = time.monotonic() + HEAD_START_S
                 self._further.append(slot)
         self.step()
@@ -229,9 +231,11 @@ class Supervisor(Stacked):
             slot.process.started_s = time.monotonic()
             log.warning("%s: the spare, process %d, takes its place", slot.worker, slot.process.pid)
             return
-        slot.process = ChildProcess(
-            self._command(f"velod.workers.{stage_of(slot.worker)}", slot.worker), self._on_line
-        )
+        stage = stage_of(slot.worker)
+        command = self._command(f"velod.workers.{stage}", slot.worker)
+        if slot.is_further and not slot.restarts:
+            command = [*self._command("velod.runtime.spare", slot.worker), "--stages", stage]
+        slot.process = ChildProcess(command, self._on_line)
         log.info("%s: process %d started", slot.worker, slot.process.pid)
 
     def _bury(self, slot: _Slot) -> None:

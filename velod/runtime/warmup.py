@@ -122,9 +122,9 @@ def _stereo_batches(calibration: Calibration) -> Iterator[Message]:
 def _estimates(calibration: Calibration) -> Iterator[Message]:
     """What a rig that slides sideways past points at several depths gives the optimizer."""
     from velod.geometry.camera import motion_field_rows
-    from velod.geometry.rectify import rectify
+    from velod.geometry.rectify import rectified_pair
 
-    rect = rectify(calibration)
+    rect = rectified_pair(calibration)
     rng = np.random.default_rng(0)
     n = 80
     for k in range(int(_SECONDS * NS_PER_S) // _BATCH_NS):

@@ -16,11 +16,9 @@ from threading import Event, Thread
 import zenoh
 
 from velod.config import Settings, ZenohSettings
-from velod.runtime import warmup
 from velod.runtime.access import ROLES
 from velod.runtime.kernel_cache import ensure_cache_directory
 from velod.runtime.parent import die_with
-from velod.runtime.roles import SHELLS
 from velod.runtime.session import introducer_endpoint, open_session
 from velod.runtime.settings_service import fetch
 from velod.runtime.stages import Stage, create_stage, stage_of
@@ -38,6 +36,8 @@ def main(stage: str, argv: Sequence[str] | None = None) -> int:
     """Run one worker of ``stage`` until SIGTERM or SIGINT; returns the exit code."""
     args = worker_parser(f"python -P -m velod.workers.{stage}", worker=f"{stage}-0").parse_args(argv)
     start_logging(args.worker)
+    from velod.runtime import warmup  # kernels, which the supervisor has no use for
+
     try:
         if stage_of(args.worker) != stage:
             raise ValueError(f"--worker {args.worker}: must be {stage}-<number>")
@@ -56,6 +56,8 @@ def main(stage: str, argv: Sequence[str] | None = None) -> int:
 
 def serve_stage(session: zenoh.Session, settings: Settings, worker: str, stage: Stage, stop: Event) -> None:
     """Handle messages as ``worker`` until ``stop`` is set."""
+    from velod.runtime.roles import SHELLS
+
     # What was made until now lives as long as the process: the collector need not look at it again.
     gc.collect()
     gc.freeze()
