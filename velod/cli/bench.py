@@ -61,7 +61,7 @@ def bench(group: str, json: str | None, size: Size | None = None) -> int:
 
 
 def hop(size: Size) -> list[Result]:
-    """``hop.velod`` and ``hop.zenoh``: a packet of 45,000 events (405 KB) from one process to another, each way in turn.
+    """``hop.velod`` and ``hop.zenoh``: a packet of 45,000 events (405 KB) between processes, each way in turn.
 
     velod's from before encoding to a checked message in a stage's hands, raw Zenoh's and the socket's as bytes.
     """
