@@ -24,6 +24,7 @@ from velod.wire.topics import HEALTH, VELOCITY, Topic, key
 START_S = 180.0
 POLL_S = 0.02
 _COLLECTED = 1 << 20
+_READ_AT_ONCE = (VELOCITY.name, HEALTH.name)
 _LOSSES = (
     "gap.",
     "inbox.",
@@ -105,9 +106,10 @@ def run_online(
 ) -> OnlineResult:
     """Start the service, run the driver to its end, stop everything.
 
-    ``on_velocity`` is called with each velocity, ``on_message`` with each message of further ``topics``,
-    ``on_envelope`` with the same and their host times, ``on_step`` every 20 ms or so, all in this thread. Setting
-    ``stop`` ends the run early. Raises OnlineError, SessionError.
+    ``on_velocity`` is called with each velocity, ``on_message`` with each message of further ``topics``, ``on_step``
+    every 20 ms or so, all in this thread; ``on_envelope`` instead of ``on_message`` when the run is over, with host
+    times as well, so that reading them takes nothing from it: until then they are kept in memory. Setting ``stop`` ends the
+    run early. Raises OnlineError, SessionError.
     """
     result = OnlineResult()
     with Supervisor(settings, calibration, spare=spare, on_line=on_line) as supervisor:
@@ -129,6 +131,7 @@ def run_online(
         result.restarts = supervisor.restarts()
         supervisor.stop_workers()
         collector.drain(time.monotonic() + 10 * POLL_S)
+    collector.read_kept()
     return result
 
 
@@ -161,6 +164,7 @@ class _Collector:
         self._result, self._rig = result, rig
         self._on_velocity, self._on_message, self._on_envelope = on_velocity, on_message, on_envelope
         self._inbox = Inbox()
+        self._kept: list[Item] = []
         self._gaps = GapCounter()
 
     def subscribe(self, session: zenoh.Session, topics: Iterable[Topic]) -> None:
@@ -183,11 +187,19 @@ class _Collector:
 
         session.declare_subscriber(key(topic, self._rig), zenoh.handlers.Callback(arrived, indirect=False))
 
+    def read_kept(self) -> None:
+        """Hand over what was kept until the end of the run."""
+        for item in self._kept:
+            if self._on_envelope is not None and (envelope := _decoded(item)) is not None:
+                self._on_envelope(envelope)
+        self._kept.clear()
+
     def _take(self, item: Item) -> None:
-        try:
-            envelope = decode(item.data)
-        except WireError:
-            return  # an alien publisher; those whom it concerns count it
+        if self._on_envelope is not None and item.source not in _READ_AT_ONCE:
+            self._kept.append(item)
+            return
+        if (envelope := _decoded(item)) is None:
+            return
         message = envelope.message
         if isinstance(message, Velocity):
             self._gaps.see(message.seq)
@@ -198,8 +210,13 @@ class _Collector:
                 self._on_velocity(published)
         elif isinstance(message, Health):
             self._result.health[message.worker] = message
-        else:
-            if self._on_message is not None:
-                self._on_message(message)
-            if self._on_envelope is not None:
-                self._on_envelope(envelope)
+        elif self._on_message is not None:
+            self._on_message(message)
+
+
+def _decoded(item: Item) -> Envelope | None:
+    """None for the message of an alien publisher: those whom it concerns count it."""
+    try:
+        return decode(item.data)
+    except WireError:
+        return None
