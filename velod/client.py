@@ -17,10 +17,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import zenoh
 
 from velod.config import ZenohSettings
 from velod.runtime.access import may_read
+from velod.runtime.callbacks import direct
 from velod.runtime.inbox import Inbox
 from velod.runtime.measure import GapCounter, HostClocks
 from velod.runtime.session import SessionError, open_session
@@ -105,9 +105,7 @@ class Listener(Stacked):
                 sources[at] = source
             self._inbox.put(source, at, sample.payload.to_bytes())
 
-        # "indirect" would hand each sample to one more thread; the inbox is hand-over enough.
-        callback = zenoh.handlers.Callback(arrived, indirect=False)
-        return self._session.declare_subscriber(key(topic, self._rig), callback)
+        return self._session.declare_subscriber(key(topic, self._rig), direct(arrived))
 
     def receive(self, timeout_s: float = math.inf) -> Received | None:
         """The next message that can be read; None after ``timeout_s`` without one."""

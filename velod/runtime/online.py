@@ -13,6 +13,7 @@ import zenoh
 
 from velod.config import Settings
 from velod.geometry.calibration import Calibration
+from velod.runtime.callbacks import direct
 from velod.runtime.inbox import Inbox, Item
 from velod.runtime.measure import GapCounter
 from velod.runtime.process import ChildProcess, LineSink, stop_all, to_stderr
@@ -108,8 +109,8 @@ def run_online(
 
     ``on_velocity`` is called with each velocity, ``on_message`` with each message of further ``topics``, ``on_step``
     every 20 ms or so, all in this thread; ``on_envelope`` instead of ``on_message`` when the run is over, with host
-    times as well, so that reading them takes nothing from it: until then they are kept in memory. Setting ``stop`` ends the
-    run early. Raises OnlineError, SessionError.
+    times as well, so that reading them takes nothing from it: until then they are kept in memory. Setting ``stop``
+    ends the run early. Raises OnlineError, SessionError.
     """
     result = OnlineResult()
     with Supervisor(settings, calibration, spare=spare, on_line=on_line) as supervisor:
@@ -185,7 +186,7 @@ class _Collector:
         def arrived(sample: zenoh.Sample) -> None:
             self._inbox.put(topic.name, str(sample.key_expr), sample.payload.to_bytes())
 
-        session.declare_subscriber(key(topic, self._rig), zenoh.handlers.Callback(arrived, indirect=False))
+        session.declare_subscriber(key(topic, self._rig), direct(arrived))
 
     def read_kept(self) -> None:
         """Hand over what was kept until the end of the run."""

@@ -21,6 +21,7 @@ from velod.config import ZenohSettings
 from velod.geometry.calibration import load_calibration
 from velod.io import open_recording
 from velod.io.packets import Chunking, repeated
+from velod.runtime.callbacks import direct
 from velod.runtime.health import HealthReporter
 from velod.runtime.outlet import Outlet
 from velod.runtime.prefetch import Prefetch
@@ -74,10 +75,10 @@ class Service(Stacked):
         self.heard_s = 0.0  # when the newest velocity came
 
     def _open(self, stack: ExitStack) -> None:
-        callback = zenoh.handlers.Callback(self._on_token, indirect=False)
+        callback = direct(self._on_token)
         tokens = self._session.liveliness().declare_subscriber(key(ALIVE, self._rig), callback, history=True)
         stack.enter_context(tokens)
-        callback = zenoh.handlers.Callback(self._on_velocity, indirect=False)
+        callback = direct(self._on_velocity)
         stack.enter_context(self._session.declare_subscriber(key(VELOCITY, self._rig), callback))
 
     def wait_until_up(self, stop: Event, timeout_s: float = START_S) -> None:

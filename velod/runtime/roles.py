@@ -13,6 +13,7 @@ import zenoh
 
 from velod.config import Settings
 from velod.runtime.budget import LoadShedder
+from velod.runtime.callbacks import direct
 from velod.runtime.dispatching import BatchDispatch
 from velod.runtime.imu_bridge import ImuBridge
 from velod.runtime.inbox import Item
@@ -249,7 +250,7 @@ class OptimizerShell(WorkerShell):
             author = "" if sample.attachment is None else sample.attachment.to_string()
             self.inbox.put(topic.name, author, sample.payload.to_bytes())
 
-        callback = zenoh.handlers.Callback(arrived, indirect=False)
+        callback = direct(arrived)
         at = key(topic, self.rig)
         stack.enter_context(self.session.declare_subscriber(at, callback, allowed_origin=zenoh.Locality.REMOTE))
 

@@ -17,6 +17,7 @@ import zenoh
 
 from velod.config import Settings
 from velod.runtime import prime
+from velod.runtime.callbacks import direct
 from velod.runtime.health import HealthReporter
 from velod.runtime.inbox import Inbox, Item
 from velod.runtime.measure import GapCounter
@@ -163,9 +164,7 @@ class WorkerShell:
         def arrived(sample: zenoh.Sample) -> None:
             self.inbox.put(topic.name, str(sample.key_expr), sample.payload.to_bytes())
 
-        # "indirect" would hand each sample to one more thread; the inbox is hand-over enough.
-        callback = zenoh.handlers.Callback(arrived, indirect=False)
-        stack.enter_context(self.session.declare_subscriber(at, callback))
+        stack.enter_context(self.session.declare_subscriber(at, direct(arrived)))
 
     def listen_to_tokens(self, stack: ExitStack, **parts: str) -> None:
         """Hear of processes that come and go, those included that are there already."""
@@ -175,7 +174,7 @@ class WorkerShell:
             came = sample.kind == zenoh.SampleKind.PUT
             self.inbox.put(_TOKENS, str(sample.key_expr), _CAME if came else _WENT)
 
-        callback = zenoh.handlers.Callback(changed, indirect=False)
+        callback = direct(changed)
         tokens = self.session.liveliness().declare_subscriber(key(ALIVE, self.rig, **parts), callback, history=True)
         stack.enter_context(tokens)
 
