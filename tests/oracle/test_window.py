@@ -66,9 +66,9 @@ def dense_twin(window, interval):
     return H[:n, :n] - H[:n, n:] @ gain[:, :-1], h[:n] - H[:n, n:] @ gain[:, -1]
 
 
-def filled(segments, rng):
+def filled(segments, rng, bias_margins=(1.0, 1.0)):
     """A window that has lived through 12 segments with the same random factors, keeping ``segments`` of them."""
-    w = Window(ImuSettings(), KNOT_NS, segments, smoothness=0.5, common_sigma=COMMON_SIGMA)
+    w = Window(ImuSettings(), KNOT_NS, segments, 0.5, COMMON_SIGMA, bias_margins)
     w.start(0, np.array([1.0, -9.0, 3.0]))
     for k in range(12):
         if k:
@@ -87,6 +87,17 @@ def test_marginalisation_equals_the_full_batch_solution():
     assert np.allclose(whole.selector(t) @ x.x, sliding.selector(t) @ y.x, atol=1e-6)
     P, Q = x.cov(whole.selector(t)), y.cov(sliding.selector(t))
     assert np.abs((P - Q) / np.sqrt(np.outer(np.diag(P), np.diag(P)))).max() < 1e-4
+
+
+def test_a_prior_that_is_widened_later_was_as_wide_from_the_start():
+    late, early = (filled(12, np.random.default_rng(5), margins) for margins in ((1.0, 1.0), (4.0, 9.0)))
+    late.solve([], None, 0.0)
+    assert late.holds_start and not filled(4, np.random.default_rng(5)).holds_start
+    late.widen_bias_prior((4.0, 9.0))
+    x, y = late.solve([], None, 0.0), early.solve([], None, 0.0)
+    F = early.selector(int(11.7 * KNOT_NS))
+    assert np.allclose(F @ x.x, F @ y.x, atol=1e-9)
+    assert np.allclose(x.cov(F), y.cov(F), rtol=1e-6, atol=1e-12)
 
 
 def dense(window):

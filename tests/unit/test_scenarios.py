@@ -196,6 +196,26 @@ def test_biases_ten_times_larger_than_specified_are_found():
     assert np.linalg.norm(stage._estimator.head.b_w - b_w) < 0.25 * np.linalg.norm(b_w)
 
 
+def test_biases_beyond_their_specification_are_in_the_covariance_from_the_first_velocity_on():
+    """Six sigmas in every axis: the prior gives way as soon as the flows contradict it, and nothing begins anew."""
+    squared = []
+    for signs in ([1, -1, 1], [-1, 1, 1], [1, 1, -1]):
+        b_a, b_w = 0.3 * np.array(signs), 0.03 * np.array(signs[::-1])
+        velocities, _ = run(with_imu(messages(FLIGHT, 1.0), lambda t, a, w, b_a=b_a, b_w=b_w: (a + b_a, w + b_w)))
+        assert all(v.valid for v in velocities if v.t_ns > 0.15e9)
+        squared.append(nees(velocities, FLIGHT))
+    assert np.concatenate(squared).mean() < 4.0
+
+
+def test_an_accelerometer_in_g_gives_no_velocity():
+    """What is taken for its bias cannot be one: not valid, and why, a quarter of a second after the start."""
+    for motion in (FLIGHT, STEADY):
+        velocities, _ = run(with_imu(messages(motion, 1.0), lambda t, a, w: (a / 9.81, w)))
+        later = between(velocities, 0.25, 1.0)
+        assert not any(v.valid for v in later)
+        assert any("in g" in v.reason for v in later)
+
+
 def test_sixty_seconds_at_rest():
     """No event at all after the first second: within 5 mm/s throughout, and the biases converge."""
     b_a, b_w = np.array([0.08, -0.05, 0.1]), np.array([0.008, -0.006, 0.004])

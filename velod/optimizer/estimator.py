@@ -13,6 +13,7 @@ from velod.geometry.calibration import Calibration
 from velod.geometry.rectify import rectified_pair
 from velod.optimizer import attitude, degeneracy, flow_equation, inertial_residual, overlap
 from velod.optimizer.attitude import Attitude
+from velod.optimizer.bias_prior import EXCESSIVE, implausible, likely_margins
 from velod.optimizer.consistency import Consistency
 from velod.optimizer.depth_share import cameras_disagree
 from velod.optimizer.equations import EquationMaker, Equations, Prediction
@@ -36,12 +37,8 @@ INNOVATION_GATE = 25.0
 """Squared Mahalanobis distance from which a batch that contradicts the prediction loses weight (5 sigma)."""
 RESTING_SIGMA = 0.002
 """m/s, of what may have begun since rest was observed last and the IMU does not show."""
-BIAS_TRIAL_NS, BIAS_TRIAL_SIGMAS = 2_000_000_000, 3.0
-"""A bias that is found so large so soon was not drawn with its specified sigma ..."""
 NOISE_TRIAL_NS, MUCH_NOISIER = 300_000_000, 1.5
 """Noise that is found so soon, and so much more of it, was in all that has been taken in."""
-BIAS_MARGIN = 10.0
-"""... which is then taken this many times: always, it would cost a third of the accuracy."""
 USUAL_DEPTH = 3.0
 """m, before any was seen."""
 MAX_INTEGRATED = 1000.0
@@ -100,7 +97,7 @@ class Estimator:
         self.counters: dict[str, int] = {}
         self.memory = InertialMemory(o.window_s + 3.0)
         self._segments = int(np.ceil(o.window_s / o.knot_s)) + 1
-        self._bias_margin = 1.0
+        self._bias_margins = (1.0, 1.0)  # on the specified sigmas of b_a and b_w
         self.consistency = Consistency()
         self.rotation_check = rotation_check or RotationCheck(
             o.imu_clock_sigma_ms * 1e-3, settings.imu.gyro_noise, o.correct_imu_clock
@@ -117,7 +114,7 @@ class Estimator:
         o = self._o
         common_sigma = np.array([o.flow_scale_sigma, o.delay_sigma_ms * 1e-3, o.depth_scale_sigma])
         self.window = Window(
-            self._imu, self._knot_ns, self._segments, SMOOTHNESS[o.spline], common_sigma, self._bias_margin,
+            self._imu, self._knot_ns, self._segments, SMOOTHNESS[o.spline], common_sigma, self._bias_margins,
             o.shared_gyro_noise,
         )  # fmt: skip
         self.head: Head | None = None
@@ -145,6 +142,7 @@ class Estimator:
         self.memory.integrate_to(flow.t_ns, *self._biases())
         self._look_at_noise(flow.t_ns)
         self._start_anew_where_it_is_wrong(flow.t_ns)
+        self._widen_bias_prior()
         self._correct_stamps(flow.t_ns)
         equations = self._equations(flow, depth)
         late = self.head is not None and flow.t_ns <= self.head.t_ns
@@ -194,10 +192,21 @@ class Estimator:
             self._count("estimate.restart_on_disagreement")
             self.consistency.start_anew()
             self._forget()
-        elif self._bias_margin == 1.0 and self._biases_exceed_specification():
-            self._count("bias.beyond_specification")
-            self._bias_margin = BIAS_MARGIN
-            self._forget()
+
+    def _widen_bias_prior(self) -> None:
+        """As wide as the biases make likely that are found, while their prior is in the window."""
+        head = self.head
+        if head is None or not self.window.holds_start:
+            return
+        imu, seconds = self._imu, (head.t_ns - self._started_ns) * 1e-9
+        sigma = np.repeat([imu.accel_bias_sigma, imu.gyro_bias_sigma], 3)
+        walked = np.repeat([imu.accel_bias_walk, imu.gyro_bias_walk], 3) ** 2 * seconds
+        biases = np.concatenate([head.b_a, head.b_w])
+        margins = likely_margins(biases, head.cov[3:9, 3:9], sigma, walked, self._bias_margins)
+        if margins != self._bias_margins:
+            self._bias_margins = margins
+            self.window.widen_bias_prior(margins)
+            self._count("bias.prior_changed")
 
     def _correct_stamps(self, t_ns: int) -> None:
         """Take the delay of the events out of their stamps, once it is certain."""
@@ -205,14 +214,6 @@ class Estimator:
             self._count("clock.corrected")
             self._shift(np.zeros(3), np.array([0.0, -step_s, 0.0]))
             self.window.begin_common_anew(COMMON.index("delay"))
-
-    def _biases_exceed_specification(self) -> bool:
-        """Whether they were not drawn with the sigmas of the settings; later on they may have walked."""
-        head = self.head
-        if head is None or head.t_ns - self._started_ns > BIAS_TRIAL_NS:
-            return False
-        accel, gyro = np.abs(head.b_a) / self._imu.accel_bias_sigma, np.abs(head.b_w) / self._imu.gyro_bias_sigma
-        return bool(max(accel.max(), gyro.max()) > BIAS_TRIAL_SIGMAS)
 
     def predict(self, t_ns: int) -> tuple[F64, F64] | None:
         """v_B (3,) and its covariance (3, 3) at ``t_ns``, carried there from the head by the IMU (Eq. 10)."""
@@ -277,7 +278,12 @@ class Estimator:
     @property
     def biases_as_specified(self) -> bool:
         """Whether no bias has been found that was not drawn with its sigma."""
-        return self._bias_margin == 1.0
+        return max(self._bias_margins) < EXCESSIVE
+
+    @property
+    def implausible_bias(self) -> str:
+        """What is taken for a bias and cannot be one, in words; empty if nothing is."""
+        return "" if self.head is None else implausible(self.head.b_a, self.head.b_w, self._imu)
 
     @property
     def dark(self) -> bool:

@@ -367,6 +367,10 @@ class OptimizerStage:
         if self._estimator.consistency.on_probation:
             self._was_valid, self._was_lost = False, True
             return TrackingState.LOST, disagreement, False
+        if impossible := self._estimator.implausible_bias:
+            self._was_lost |= self._was_valid
+            self._was_valid = False
+            return TrackingState.LOST if self._was_lost else TrackingState.INITIALISING, impossible, False
         if not self._was_valid:
             state = TrackingState.LOST if self._was_lost else TrackingState.INITIALISING
             if self._estimator.batches < MIN_BATCHES:

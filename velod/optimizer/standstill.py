@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from velod.config import ImuSettings
+from velod.optimizer.bias_prior import IMPLAUSIBLE
 from velod.optimizer.inertial import InertialMemory
 from velod.types import F64, FlowBatch
 
@@ -27,8 +28,6 @@ SIGMAS = 4.0
 """Spread of the samples, in sigmas of the sensor's noise, up to which it is noise ..."""
 GYRO_FLOOR, ACCEL_FLOOR = 0.005, 0.05
 """... and at least this much, rad/s and m/s^2: no IMU is as good as its data sheet."""
-BIAS_SIGMAS = 30.0
-"""A bias may be as large as this many of its specified sigmas."""
 MAX_RATE = 0.02
 """Mean angular velocity at rest, less the bias, rad/s, beyond the bias's own uncertainty."""
 MAX_SPECIFIC_FORCE_ERROR = 0.3
@@ -112,9 +111,9 @@ class Standstill:
         return bool(
             np.all(gyro.std(axis=0) < max(SIGMAS * gyro_noise, GYRO_FLOOR))
             and np.all(accel.std(axis=0) < max(SIGMAS * accel_noise, ACCEL_FLOOR))
-            and np.linalg.norm(gyro.mean(axis=0) - b_w) < MAX_RATE + BIAS_SIGMAS * self.imu.gyro_bias_sigma
+            and np.linalg.norm(gyro.mean(axis=0) - b_w) < MAX_RATE + IMPLAUSIBLE * self.imu.gyro_bias_sigma
             and abs(np.linalg.norm(accel.mean(axis=0)) - self.imu.gravity)
-            < MAX_SPECIFIC_FORCE_ERROR + BIAS_SIGMAS * self.imu.accel_bias_sigma
+            < MAX_SPECIFIC_FORCE_ERROR + IMPLAUSIBLE * self.imu.accel_bias_sigma
         )
 
 

@@ -66,15 +66,16 @@ class Window:
         segments: int,
         smoothness: float,
         common_sigma: F64,
-        bias_margin: float = 1.0,
+        bias_margins: tuple[float, float] = (1.0, 1.0),
         shared_gyro_noise: bool = True,
     ) -> None:
         """``smoothness``: sigma of the second difference of control points, m/s; weak, so that none is free.
 
-        ``common_sigma`` (3,): of the common errors of the flows; ``bias_margin`` is on the biases' sigmas at start;
+        ``common_sigma`` (3,): of the common errors of the flows; ``bias_margins`` are on the sigmas of b_a and b_w at
+        the start;
         ``shared_gyro_noise``: whether intervals leave the gyroscope's noise to be found by the flows as well.
         """
-        self._bias_margin = bias_margin
+        self._bias_margins = bias_margins
         self._common_sigma = common_sigma
         self._common_lasts = np.ones(3)
         self._shared_gyro_noise = shared_gyro_noise
@@ -96,6 +97,7 @@ class Window:
         self._forward = np.zeros(size)
         self.first = 0
         self.last = -1
+        self._started = 0  # the first segment of all
 
     def use_noise(self, imu: ImuSettings) -> None:
         """From here on the IMU has these densities and walks; what has been added keeps its own."""
@@ -129,9 +131,9 @@ class Window:
         self._front = -1
         at = np.arange(HEAD)
         self._H[at, at] = 1.0 / UNKNOWN_VELOCITY**2
+        self._started = self.first
         b = self.bias_columns(self.last)
-        sigma = self._bias_margin * np.repeat([self._imu.accel_bias_sigma, self._imu.gyro_bias_sigma], 3)
-        self._H[b, b] = 1.0 / sigma**2
+        self._H[b, b] = self._bias_information()
         g = self.gravity_columns(self.last)
         gravity = self._imu.gravity
         acceleration = math.hypot(ACCELERATION, 2.0 * (float(np.linalg.norm(force_L)) - gravity))
@@ -141,6 +143,27 @@ class Window:
         c = self.common_columns(self.last)
         self._H[c, c] = 1.0 / self._common_sigma**2
         self._smooth_newest()
+
+    @property
+    def holds_start(self) -> bool:
+        """Whether the first segment of all is in the window, and ``widen_bias_prior`` exact."""
+        return not self.empty and self.first == self._started
+
+    def widen_bias_prior(self, margins: tuple[float, float]) -> None:
+        """Put other ``margins`` on the sigmas of the biases at the start, which must be in the window still.
+
+        All factors being linear, the states become those that they would be with them from the start.
+        """
+        b = self.bias_columns(self._started)
+        self._H[b, b] -= self._bias_information()
+        self._bias_margins = margins
+        self._H[b, b] += self._bias_information()
+        self._front = -1
+
+    def _bias_information(self) -> F64:
+        """Of [b_a, b_w] (6,) at the start."""
+        sigma = np.array([self._imu.accel_bias_sigma, self._imu.gyro_bias_sigma]) * self._bias_margins
+        return np.repeat(sigma**-2.0, 3)
 
     def extend(self, D_L: F64, g_L: F64, b_w: F64, dt: float) -> None:
         """Open the next segment, marginalising the oldest when the window is full.

@@ -1,0 +1,67 @@
+"""How wide the prior of the IMU's biases has to be, by what is found of them.
+
+Sigmas of biases are those of a calibrated IMU; others turn up. A prior that is always wide costs a third of the
+accuracy in the first second; a narrow one of a large bias costs more, and is sure of it. So accelerometer and
+gyroscope have an unknown margin each on their sigmas. It is 1 unless the data are much likelier with another one.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from velod.config import ImuSettings
+from velod.types import F64
+
+MARGINS = np.array([1.0, 1.5, 2.2, 3.3, 5.0, 7.5, 11.0])
+"""What is tried; those beyond 1 are equally likely before anything is seen."""
+AS_SPECIFIED = 0.95
+"""Of sensors, whose biases are drawn with the specified sigma. With 0.8 the error without a bias is 1 % larger."""
+EXCESSIVE = 3.0
+"""A margin from which on the biases are not those of the IMU that the settings speak of."""
+IMPLAUSIBLE = 30.0
+"""Specified sigmas: no sensor has such a bias, 1.5 m/s^2 or 9 degrees per second by the usual settings."""
+CHANGED = 1.1
+"""A margin that differs by less from the one in use is the same."""
+
+_PAIRS = np.array([(accel, gyro) for accel in MARGINS for gyro in MARGINS])
+_EACH = np.repeat(_PAIRS, 3, axis=1)  # (pairs, 6), of b_a and b_w
+_LOG_PRIOR = np.log(np.where(_PAIRS == 1.0, AS_SPECIFIED, (1.0 - AS_SPECIFIED) / (len(MARGINS) - 1))).sum(axis=1)
+
+
+def likely_margins(
+    biases: F64, cov: F64, sigma: F64, walked: F64, margins: tuple[float, float]
+) -> tuple[float, float]:
+    """Margins of b_a and b_w on the specified ``sigma`` (6,) of the start: the mean of their logarithms.
+
+    ``biases`` (6,) [m/s^2, rad/s] with ``cov`` (6, 6) are the estimate that was made with ``margins``, and ``walked``
+    (6,) the variance that they may have gathered since the start.
+    """
+    information = np.linalg.inv(cov)
+    used = (np.repeat(margins, 3) * sigma) ** 2 + walked
+    tried = (_EACH * sigma) ** 2 + walked
+    # of the data and each of the priors together
+    A = information + (1.0 / tried - 1.0 / used)[:, :, None] * np.eye(6)
+    right = information @ biases
+    # the density of the data with the biases integrated out
+    log_likelihood = 0.5 * (
+        np.linalg.solve(A, np.broadcast_to(right, tried.shape)[:, :, None])[:, :, 0] @ right
+        - np.linalg.slogdet(A)[1]
+        - np.log(tried).sum(axis=1)
+    )
+    log_weight = log_likelihood + _LOG_PRIOR
+    weight = np.exp(log_weight - log_weight.max())
+    log_margins = weight @ np.log(_PAIRS) / weight.sum()
+    if np.abs(log_margins - np.log(margins)).max() < np.log(CHANGED):
+        return margins
+    accel, gyro = np.exp(log_margins)
+    return float(accel), float(gyro)
+
+
+def implausible(b_a: F64, b_w: F64, imu: ImuSettings) -> str:
+    """What cannot be a bias, in words: other units, or other axes, are taken for one. Empty if nothing is."""
+    accel, gyro = float(np.abs(b_a).max()), float(np.abs(b_w).max())
+    if accel > IMPLAUSIBLE * imu.accel_bias_sigma:
+        return f"the accelerometer is off by {accel:.1f} m/s^2: is it in g?"
+    if gyro > IMPLAUSIBLE * imu.gyro_bias_sigma:
+        return f"the gyroscope is off by {gyro:.2f} rad/s: its axes, T_cam_imu?"
+    return ""
