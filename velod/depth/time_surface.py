@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from numba import njit
 
+from velod.events.columns import readonly
 from velod.types import F32, NS_PER_S, U16
 
 
@@ -38,7 +39,7 @@ class TimeSurface:
         """(height, width) float32 in 0..1 of ages (h, w) on the sensor grid, with ``table`` from ``decay_table``."""
         surface = np.empty(ages.shape, np.float32)
         # The maps mirror by themselves.
-        _decay(ages, table, self._mirrored and self._maps is None, surface)
+        _decay(readonly(ages, np.uint16), table, self._mirrored and self._maps is None, surface)
         return surface if self._maps is None else np.asarray(cv2.remap(surface, *self._maps, cv2.INTER_LINEAR))
 
 

@@ -150,14 +150,10 @@ def _check(
     dropped: I64,
 ) -> int:
     """Copy the events that are on the sensor, of polarity 0 or 1, in time order, in a kept row; returns how many."""
-    n = t_ns.size
-    if band_rows >= BAND_ROWS and _are_good(x, y, t_ns, p, width, height, not_before_ns):
-        # One by one: all in one statement they are copied twice.
-        out_x[:] = x
-        out_y[:] = y
-        out_t_ns[:] = t_ns
-        out_p[:] = p
-        return n
+    if band_rows >= BAND_ROWS and _copy_good(
+        x, y, t_ns, p, width, height, not_before_ns, out_x, out_y, out_t_ns, out_p
+    ):
+        return t_ns.size
     n = 0
     for i in range(t_ns.size):
         if x[i] >= width or y[i] >= height:
@@ -177,18 +173,35 @@ def _check(
 
 
 @njit(cache=True, nogil=True)
-def _are_good(x: U16, y: U16, t_ns: I64, p: U8, width: int, height: int, not_before_ns: int) -> bool:
-    """Whether there is nothing to drop, as nearly always; loops that vectorise, a column each."""
+def _copy_good(
+    x: U16,
+    y: U16,
+    t_ns: I64,
+    p: U8,
+    width: int,
+    height: int,
+    not_before_ns: int,
+    out_x: U16,
+    out_y: U16,
+    out_t_ns: I64,
+    out_p: U8,
+) -> bool:
+    """Copy all events; whether there is nothing to drop, as nearly always. Loops that vectorise, a column each."""
     if t_ns.size == 0:
         return True
     last_x, last_y, highest_p, backwards = np.uint16(0), np.uint16(0), np.uint8(0), False
     for i in range(x.size):
+        out_x[i] = x[i]
         last_x = max(last_x, x[i])
     for i in range(y.size):
+        out_y[i] = y[i]
         last_y = max(last_y, y[i])
     for i in range(p.size):
+        out_p[i] = p[i]
         highest_p = max(highest_p, p[i])
+    out_t_ns[0] = t_ns[0]
     for i in range(1, t_ns.size):
+        out_t_ns[i] = t_ns[i]
         backwards |= t_ns[i] < t_ns[i - 1]
     return bool(last_x < width and last_y < height and highest_p < 2 and not backwards and t_ns[0] >= not_before_ns)
 

@@ -62,6 +62,7 @@ class IngestShell(WorkerShell):
 
     inputs: ClassVar[dict[Topic, int]] = {EVENTS: 0, IMU_SENSOR: 0}
     sends_large: ClassVar[bool] = True
+    in_place: ClassVar[bool] = True
 
     def __init__(
         self, session: zenoh.Session, settings: Settings, stage_name: str, worker: str, stage: Stage
@@ -150,6 +151,7 @@ class BatchShell(WorkerShell):
     """A flow or depth worker: one batch in, one result out, and word to the dispatcher that it is done."""
 
     depth: ClassVar[int] = 16  # of the inbox; a window of batches is sent at once, more are repeats
+    in_place: ClassVar[bool] = True
     output: ClassVar[Topic]
 
     def subscribe(self, stack: ExitStack) -> None:

@@ -50,6 +50,8 @@ class WorkerShell:
     poll_s: ClassVar[float] = POLL_S
     sends_large: ClassVar[bool] = False
     """Whether what it publishes goes through shared memory."""
+    in_place: ClassVar[bool] = False
+    """Whether the stage takes columns that lie in the message, read-only and at any address."""
 
     def __init__(
         self, session: zenoh.Session, settings: Settings, stage_name: str, worker: str, stage: Stage
@@ -205,7 +207,7 @@ class WorkerShell:
             if self.take_other(item):
                 return
             topic = self._topics.get(item.source)
-            envelope = decode(item.data, None if topic is None else topic.message)
+            envelope = decode(item.data, None if topic is None else topic.message, in_place=self.in_place)
         except WireError as e:
             self.count(e.reason, f"{item.key}: {e}")
             return

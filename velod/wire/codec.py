@@ -115,10 +115,13 @@ def _bin_header(n_bytes: int) -> bytes:
     raise WireError("wire.too_large", f"a column of {n_bytes} bytes, the limit is {MAX_BYTES}")
 
 
-def decode(data: bytes | bytearray | memoryview, expect: type[Any] | None = None) -> Envelope:
+def decode(
+    data: bytes | bytearray | memoryview, expect: type[Any] | None = None, *, in_place: bool = False
+) -> Envelope:
     """The message in ``data``; with ``expect``, only a message of that type. Raises WireError, and nothing else.
 
-    Arrays are aligned, writable copies, so that a compiled kernel sees one kind of array wherever it comes from.
+    Arrays are aligned, writable copies, so that a compiled kernel sees one kind of array wherever it comes from; with
+    ``in_place``, for those who hand them to kernels as ``readonly``, views of ``data`` but for times.
     """
     tree = _unpack(data)
     s = _schema_of(tree, expect)
@@ -126,6 +129,9 @@ def decode(data: bytes | bytearray | memoryview, expect: type[Any] | None = None
     values = {f.name: _value(s, f, tree, sizes) for f in s.fields}
     for f in s.fields:
         if f.kind == "column":
+            if not in_place:
+                # A view of the received bytes is read-only, which numba takes for another type of array.
+                values[f.name] = values[f.name].astype(f.native)
             if f.promises:
                 _check_column(s, f, values)
         elif f.not_after and values[f.name] > values[f.not_after]:
@@ -215,7 +221,7 @@ def _value(s: Schema, f: Field, tree: dict[str, Any], sizes: dict[str, int]) -> 
     """What was sent, or the default where the sender's velod did not know the field yet; what it must have sent is
     missed on reading.
     """
-    if f.name in tree or not f.optional:
+    if not f.optional or f.name in tree:
         return _READ[f.kind](s, f, tree, sizes)
     return np.full(_shape(f, sizes), f.default, f.dtype) if f.kind == "column" else copy(f.default)
 
@@ -225,12 +231,13 @@ def _shape(f: Field, sizes: dict[str, int]) -> tuple[int, ...]:
 
 
 def _read_int(s: Schema, f: Field, tree: dict[str, Any], sizes: dict[str, int]) -> int:
+    value = tree.get(f.name)
+    if type(value) is int and f.lowest <= value <= f.highest:
+        return value
     value = _get(s, f.name, tree)
     if type(value) is not int:
         raise WireError("wire.field_type", f"{s.name}: {f.name} must be an integer, got {type(value).__name__}")
-    if not f.lowest <= value <= f.highest:
-        raise WireError("wire.bounds", f"{s.name}: {f.name} = {value}, allowed {f.lowest} .. {f.highest}")
-    return value
+    raise WireError("wire.bounds", f"{s.name}: {f.name} = {value}, allowed {f.lowest} .. {f.highest}")
 
 
 def _read_float(s: Schema, f: Field, tree: dict[str, Any], sizes: dict[str, int]) -> float:
@@ -270,10 +277,12 @@ def _read_map(s: Schema, f: Field, tree: dict[str, Any], sizes: dict[str, int]) 
 def _read_column(s: Schema, f: Field, tree: dict[str, Any], sizes: dict[str, int]) -> NDArray[Any]:
     assert f.dtype is not None
     data = _bin(s, f, tree)
+    if f.counts_rows and len(f.shape) == 1:
+        _check_length(s, f, len(data), sizes[f.counts_rows] * f.row_bytes)
+        return np.frombuffer(data, f.dtype)
     shape = _shape(f, sizes)
     _check_length(s, f, len(data), math.prod(shape) * f.dtype.itemsize)
-    # A copy, because a view of the received bytes is read-only, which numba takes for another type of array.
-    return np.frombuffer(data, f.dtype).reshape(shape).astype(f.native)
+    return np.frombuffer(data, f.dtype).reshape(shape)
 
 
 def _read_times(s: Schema, f: Field, tree: dict[str, Any], sizes: dict[str, int]) -> NDArray[np.int64]:
@@ -303,7 +312,7 @@ def _check_column(s: Schema, f: Field, values: dict[str, Any]) -> None:
     a = values[f.name]
     if a.size == 0:
         return
-    lo, hi = a.min(), a.max()  # NaN where one is
+    lo, hi = np.minimum.reduce(a, None), np.maximum.reduce(a, None)  # NaN where one is
     if (f.finite is True or (f.finite and values[f.finite])) and not (math.isfinite(lo) and math.isfinite(hi)):
         raise WireError("wire.not_finite", f"{s.name}: {f.name} holds NaN or inf")
     wrong = (
