@@ -91,6 +91,9 @@ def test_a_recording_without_truth_cannot_be_compared(capsys: pytest.CaptureFixt
         (["a.h5", "--table", "synthetic"], "not both"),
         (["--stages", "--table", "synthetic"], "--stages goes with recordings"),
         (["a.h5", "--stages", "--report", "page"], "--stages goes with recordings"),
+        (["a.h5", "--stages", "--floor"], "--stages judges flow and depth alone"),
+        (["a.h5", "--jobs", "2"], "--jobs goes with --table"),
+        (["--table", "held-out", "--plot", "page"], "--plot goes with recordings"),
     ],
 )
 def test_what_cannot_be_meant_is_refused(

@@ -175,6 +175,16 @@ def test_a_malformed_packet_rate_is_named(capsys: pytest.CaptureFixture[str], re
         (["replay", "x.h5", "--speed", "-1"], "must be positive"),
         (["demo", "--seconds", "nan"], "must be positive"),
         (["run", "--only", "flow,stereo"], "no stage 'stereo'"),
+        (["demo", "--seed", "-1"], "must be a whole number from 0 on, got '-1'"),
+        (["sim", "corridor-1", "-o", "x.h5", "--texture", "1.5"], "must be a whole number from 0 on, got '1.5'"),
+        (["echo", "-n", "0"], "must be a whole number from 1 on, got '0'"),
+        (["router", "--port", "99999"], "must be a whole number from 1 to 65535, got '99999'"),
+        (["config", "keys", "keys", "--days", "nan"], "must be positive"),
+        (["config", "keys", "keys", "--rig", "../rig0"], "must be one part of a key"),
+        (["config", "keys", "keys", "--host", "a/b"], "must be the name or address of a host"),
+        (["config", "topology", "remote", "--max-hz", "-1"], "must be zero or more"),
+        (["prove", "fleet", "--hz", "0"], "must be positive"),
+        (["prove", "scaling", "--workers", "0"], "must be a whole number from 1 on"),
         ([], "COMMAND"),
     ],
 )
@@ -200,9 +210,35 @@ def test_a_result_that_cannot_be_written_is_named(capsys: pytest.CaptureFixture[
 
 def test_a_result_that_cannot_be_written_is_named_before_the_work(capsys: pytest.CaptureFixture[str]) -> None:
     # The recording, which is not there either, is not looked at.
-    for argv in (["replay", "absent.h5", "--csv"], ["eval", "absent.h5", "--json"], ["demo", "--csv"]):
+    commands = (["replay", "absent.h5", "--csv"], ["eval", "absent.h5", "--json"], ["demo", "--csv"])
+    for argv in (*commands, ["bench", "--json"], ["prove", "fuzz", "--json"], ["doctor", "--json"]):
         assert error_of(capsys, *argv, "nowhere/out") == "nowhere/out: No such file or directory"
         assert error_of(capsys, *argv, "/") == "/: Is a directory"
+
+
+def test_a_folder_or_page_that_cannot_be_written_is_named_before_the_work(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    (taken := tmp_path / "taken").write_text("no table\n")
+    for option in ("--plot", "--report"):
+        assert error_of(capsys, "eval", "absent.h5", option, str(taken)) == f"{taken}: File exists"
+    for argv in (["eval", "--table", "synthetic"], ["eval", "absent.h5"]):
+        assert "there is no place for these tables" in error_of(capsys, *argv, "--markdown", str(taken))
+    assert error_of(capsys, "record", "nowhere/run.h5") == "nowhere/run.h5: No such file or directory"
+
+
+def test_a_simulation_of_no_time_is_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    error = error_of(capsys, "sim", "corridor-1", "-o", str(tmp_path / "a.h5"), "--seconds", "1e-9")
+    assert error == "1e-09 s are less than a microsecond"
+
+
+def test_a_folder_in_place_of_settings_or_a_file_that_is_no_text_is_named(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    (binary := tmp_path / "binary.toml").write_bytes(b"\xff\xfe")
+    assert error_of(capsys, "config", "check", str(tmp_path)) == f"{tmp_path}: cannot be read: Is a directory"
+    for argv in (["config", "check", str(binary)], ["config", "calibration", str(binary)]):
+        assert error_of(capsys, *argv) == f"{binary}: cannot be read: not text in UTF-8"
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no device that is always full")

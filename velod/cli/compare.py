@@ -17,7 +17,7 @@ from velod.cli.stages import true_depth_of
 from velod.config import Settings
 from velod.eval.floor import with_perfect_flow_and_depth
 from velod.eval.front_end import FrontEnd, estimate
-from velod.eval.markdown import put_into
+from velod.eval.markdown import put_into, require_place
 from velod.eval.metrics import evaluate
 from velod.eval.report import Report
 from velod.eval.table import all_tables, as_json, more_tables, notes, text_table
@@ -69,7 +69,7 @@ def compare_sequences(config: str | None, options: TableOptions, output: Output)
     names = TABLE_I if options.table == "synthetic" else HELD_OUT
     settings = settings_of(config)
     seeds = _QUICK_SEEDS if options.quick else _SEEDS
-    page = None if output.report is None else Report(output.report, _made_by(options.command))
+    page = _page(output, options.command)
     jobs = [_job(name, settings, options, seeds, draw=page is not None) for name in names]
     return _finish(run_jobs(jobs, options.processes), seeds, output, page, options.command)
 
@@ -78,7 +78,7 @@ def compare_files(config: str | None, files: Sequence[str], output: Output, cali
     """Recordings that hold the truth. Raises RunFailed where one yields no valid velocity."""
     settings = settings_of(config, calibration)
     command = f"velod eval {' '.join(files)} --report"
-    page = None if output.report is None else Report(output.report, _made_by(command))
+    page = _page(output, command)
     outcomes = []
     for at, file in enumerate(files):
         recording = open_recording(file, calibration=calibration_of(settings))
@@ -120,8 +120,11 @@ def _job(name: str, settings: Settings, options: TableOptions, seeds: tuple[int,
     )
 
 
-def _made_by(command: str) -> str:
-    return f"{command} (velod {__version__}, {commit()})"
+def _page(output: Output, command: str) -> Report | None:
+    """The page, where one is wanted. What cannot be written is known before the work: MarkdownError, OSError."""
+    if output.markdown is not None:
+        require_place(output.markdown, command)
+    return None if output.report is None else Report(output.report, f"{command} (velod {__version__}, {commit()})")
 
 
 def _finish(

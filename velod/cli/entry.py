@@ -10,6 +10,7 @@ from velod import __version__
 from velod.cli import play_commands, proof_commands, service_commands, watch_commands
 from velod.cli.exit import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE, RunFailed
 from velod.cli.options import plain
+from velod.cli.values import require_writable
 from velod.runtime.kernel_cache import ensure_cache_directory
 
 
@@ -19,6 +20,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     command: Callable[[argparse.Namespace], int] = args.command
     ensure_cache_directory()
     try:
+        require_writable(*(getattr(args, option, None) for option in ("json", "csv", "markdown")))
         return command(args)
     except KeyboardInterrupt:
         print("velod: interrupted", file=sys.stderr)

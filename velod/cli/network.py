@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from velod.cli.config import settings_of
+from velod.cli.values import host, not_negative, port, positive, rig_name
 
 if TYPE_CHECKING:
     from velod.cli.watch import Way
@@ -42,13 +43,14 @@ def way_of(args: argparse.Namespace) -> Way:
 
 def add_router_options(parser: argparse.ArgumentParser) -> None:
     """What a router needs to know; the settings file may say it as well."""
-    parser.add_argument("--port", type=int, help="on loopback (default zenoh.port, 17447)")
+    parser.add_argument("--port", type=port, help="on loopback (default zenoh.port, 17447)")
     parser.add_argument("--listen", metavar="ENDPOINT", help="where other hosts connect: tls/0.0.0.0:17448")
     parser.add_argument("--connect", metavar="ENDPOINT", help="another router to link to, tls/host:17448")
     parser.add_argument("--zenoh", metavar="FILE", help="a zenoh configuration (JSON5) instead of the above")
     parser.add_argument(
-        "--rig", action="append", default=[], metavar="NAME", help="a rig with certificates of its own; repeatable"
-    )
+        "--rig", type=rig_name, action="append", default=[], metavar="NAME",
+        help="a rig with certificates of its own; repeatable",
+    )  # fmt: skip
     add_guard_options(parser)
 
 
@@ -59,7 +61,7 @@ def add_relay_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--to-role", choices=_ROLES, default="worker", help="as whom to publish there (default worker)"
     )
-    parser.add_argument("--hz", type=float, default=1.0, help="velocities per second and rig (default 1)")
+    parser.add_argument("--hz", type=positive, default=1.0, help="velocities per second and rig (default 1)")
     add_way_options(parser)
     parser.set_defaults(rig="*")
 
@@ -68,20 +70,24 @@ def add_config_actions(keys: argparse.ArgumentParser, topology: argparse.Argumen
     """The options of ``velod config keys`` and ``velod config topology``."""
     keys.add_argument("folder", metavar="DIR", help="where to write; a CA that is there already signs")
     keys.add_argument(
-        "--host", action="append", default=[], metavar="NAME", help="name or address of the server; repeatable"
-    )
-    keys.add_argument("--days", type=float, default=365.0, help="how long the certificates are valid (default 365)")
+        "--host", type=host, action="append", default=[], metavar="NAME",
+        help="name or address of the server; repeatable",
+    )  # fmt: skip
+    keys.add_argument("--days", type=positive, default=365.0, help="for which certificates are valid (default 365)")
     keys.set_defaults(command=_keys)
     topology.add_argument("name", choices=TOPOLOGIES, metavar="NAME", help=", ".join(TOPOLOGIES))
     topology.add_argument("-o", "--output", default=".", metavar="DIR", help="where to write (default here)")
-    topology.add_argument("--host", default="velod.local", help="name or address of the router, as others reach it")
+    topology.add_argument("--host", type=host, default="velod.local", help="the router, as others reach it")
     topology.add_argument("--keys", default="/etc/velod/keys", metavar="DIR", help="certificates on each host")
-    topology.add_argument("--max-hz", type=float, default=0.0, help="remote: velocities per second and rig; 0: all")
+    topology.add_argument(
+        "--max-hz", type=not_negative, default=0.0, help="remote: velocities per second and rig; 0: all"
+    )
     topology.set_defaults(command=_topology)
     for parser in (keys, topology):
         parser.add_argument(
-            "--rig", action="append", default=[], metavar="NAME", help="a rig with its own certificates; repeatable"
-        )
+            "--rig", type=rig_name, action="append", default=[], metavar="NAME",
+            help="a rig with its own certificates; repeatable",
+        )  # fmt: skip
 
 
 def router(args: argparse.Namespace) -> int:
@@ -111,8 +117,8 @@ def relay(args: argparse.Namespace) -> int:
     from velod.relay import relay as run
     from velod.runtime.worker import start_logging, stop_on_signals
 
-    if not 0.0 < args.hz <= 1000.0:
-        raise ValueError(f"--hz {args.hz:g}: must be above 0 and at most 1000")
+    if args.hz > 1000.0:
+        raise ValueError(f"--hz {args.hz:g}: must be at most 1000")
     place = place_of(args.config, way_of(args), "consumer")
     keys = args.to_keys or place.zenoh.keys
     target = ZenohSettings(connect=args.to, keys=keys, role=args.to_role, insecure=place.zenoh.insecure)

@@ -42,28 +42,3 @@ def add_watch_options(parser: argparse.ArgumentParser) -> None:
     """Which velod to look at."""
     add_config_option(parser)
     add_way_options(parser)
-
-
-def speed(text: str) -> float:
-    """Times real time; infinity for ``max``."""
-    if text == "max":
-        return float("inf")
-    return seconds(text)
-
-
-def seconds(text: str) -> float:
-    """A time span, or any other number that is positive and finite."""
-    try:
-        value = float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"not a number: {text!r}") from None
-    if not 0.0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"must be positive and finite, got {text}")
-    return value
-
-
-def count(text: str) -> int:
-    """A whole number from 1 on."""
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"must be a whole number from 1 on, got {text!r}")
-    return int(text)

@@ -17,7 +17,6 @@ from velod.cli.report import (
     VelocityLine,
     log_above,
     progress_bar,
-    require_writable,
     with_progress,
     write_csv,
     write_json,
@@ -79,7 +78,6 @@ class Played:
 
 def replay(config: str | None, file: str, options: PlayOptions, csv: str | None) -> int:
     """Play a recording and say what came out. Raises RunFailed if that is no valid velocity."""
-    require_writable(csv)
     played = play(settings_of(config, options.calibration), file, options)
     print(summary(played, _metrics(played)))
     if csv is not None:
@@ -99,7 +97,8 @@ def evaluate_files(
     floor: bool = False,
 ) -> int:
     """Judge recordings against the truth that they hold. Raises RunFailed if one yields no valid velocity."""
-    require_writable(json)
+    if plot is not None:
+        Path(plot).mkdir(parents=True, exist_ok=True)
     settings = settings_of(config, options.calibration)
     if settings.optimizer.frame != "imu":
         raise ValueError("optimizer.frame: must be 'imu' to be judged: the truth in recordings is the IMU's")
@@ -331,7 +330,6 @@ def demo(config: str | None, name: str, seconds: float, seed: int, csv: str | No
     """Simulated sensors through the service. Raises RunFailed where the result is not as it should be."""
     from velod.sim import simulated_recording
 
-    require_writable(csv, json)
     settings = settings_of(config, calibration="")  # the simulated rig brings its own
     with _Bar(f"simulating {seconds:g} s of {name}") as bar:
         path = simulated_recording(name, seconds, seed, bar.show)
@@ -352,6 +350,8 @@ def demo(config: str | None, name: str, seconds: float, seed: int, csv: str | No
 
 def shortcomings(played: Played, metrics: Metrics, output_hz: float, limit_mps: float) -> list[str]:
     """What a demo's result lacks; empty for a good one."""
+    if not has_velocity(played):
+        return [f"no valid velocity ({played.why_not})"]
     found = []
     if not metrics.ave_mps <= limit_mps:
         found.append(f"AVE {metrics.ave_mps:.3f} m/s, at most {limit_mps:g} belongs there")

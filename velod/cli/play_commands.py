@@ -6,8 +6,9 @@ import argparse
 import os
 from typing import TYPE_CHECKING
 
-from velod.cli.options import Commands, add_config_option, command, count, seconds, speed
+from velod.cli.options import Commands, add_config_option, command
 from velod.cli.sim import add_options as add_sim_options
+from velod.cli.values import count, positive, seed, speed
 
 if TYPE_CHECKING:
     from velod.cli.play import PlayOptions
@@ -40,9 +41,9 @@ def _add_demo(commands: Commands) -> None:
         "  velod demo --sequence boxes-4           a room of boxes instead",
     )
     add_config_option(parser)
-    parser.add_argument("--seconds", type=seconds, default=5.0, help="of sensor time (default 5)")
+    parser.add_argument("--seconds", type=positive, default=5.0, help="of sensor time (default 5)")
     parser.add_argument("--sequence", default="corridor-1", help=f"{_SEQUENCES} (default corridor-1)")
-    parser.add_argument("--seed", type=int, default=1, help="of the simulated noise (default 1)")
+    parser.add_argument("--seed", type=seed, default=1, help="of the simulated noise (default 1)")
     parser.add_argument("--csv", metavar="OUT", help="write every velocity")
     parser.add_argument("--json", metavar="OUT", help="write the result; - for stdout")
 
@@ -100,12 +101,11 @@ def _add_eval(commands: Commands) -> None:
         help="judge flow and depth alone, offline, against true motion and depth: by distance, edge direction, ...",
     )
     parser.add_argument("--quick", action="store_true", help="with --table: a second of each, one IMU noise")
-    parser.add_argument("--seed", type=int, default=1, help="with --table: of the events' noise (default 1)")
-    parser.add_argument("--texture", type=int, metavar="SEED", help="with --table: other leaves on walls and boxes")
+    parser.add_argument("--seed", type=seed, help="with --table: of the events' noise (default 1)")
+    parser.add_argument("--texture", type=seed, metavar="SEED", help="with --table: other leaves on walls and boxes")
     parser.add_argument(
         "--jobs",
         type=count,
-        default=os.cpu_count() or 1,
         metavar="N",
         help="with --table: processes (default: cores)",
     )
@@ -134,8 +134,8 @@ def _add_sim(commands: Commands) -> None:
     )
     parser.add_argument("sequence", metavar="SEQUENCE")
     parser.add_argument("-o", "--output", required=True, metavar="FILE", help="HDF5 file to write")
-    parser.add_argument("--seconds", type=seconds, default=5.0, help="of sensor time (default 5)")
-    parser.add_argument("--seed", type=int, default=1, help="of the noise (default 1)")
+    parser.add_argument("--seconds", type=positive, default=5.0, help="of sensor time (default 5)")
+    parser.add_argument("--seed", type=seed, default=1, help="of the noise (default 1)")
     add_sim_options(parser)
 
 
@@ -175,21 +175,13 @@ def _replay(args: argparse.Namespace) -> int:
 
 
 def _eval(args: argparse.Namespace) -> int:
-    if args.files and args.table is not None:
-        raise ValueError("--table simulates its own recordings: give it or files, not both")
-    if args.quick and (args.files or args.table is None):
-        raise ValueError("--quick goes with --table synthetic")
-    if args.stages and (args.table is not None or args.report is not None):
-        raise ValueError("--stages goes with recordings alone; --table and --report hold it")
-    if args.table is not None and args.calibration is not None:
-        raise ValueError("--calibration goes with recordings: --table simulates its own")
+    _require_what_goes_together(args)
     if args.table is not None:
         from velod.cli.compare import Output, TableOptions, compare_sequences
 
-        options = TableOptions(args.table, args.quick, args.seed, args.texture, args.jobs)
+        seed, processes = 1 if args.seed is None else args.seed, args.jobs or os.cpu_count() or 1
+        options = TableOptions(args.table, args.quick, seed, args.texture, processes)
         return compare_sequences(args.config, options, Output(args.json, args.report, args.markdown))
-    if not args.files:
-        raise ValueError("what is to be judged? Give recordings, or --table synthetic")
     if args.stages:
         from velod.cli.stages import judge_stages
 
@@ -201,6 +193,29 @@ def _eval(args: argparse.Namespace) -> int:
     from velod.cli.play import evaluate_files
 
     return evaluate_files(args.config, args.files, _play_options(args), args.json, args.plot, floor=args.floor)
+
+
+def _require_what_goes_together(args: argparse.Namespace) -> None:
+    """Raise ValueError for options of ``velod eval`` that would have no effect."""
+    if args.files and args.table is not None:
+        raise ValueError("--table simulates its own recordings: give it or files, not both")
+    with_table = {"--quick": args.quick, "--seed": args.seed, "--texture": args.texture, "--jobs": args.jobs}
+    with_files = {
+        "--calibration": args.calibration,
+        "--plot": args.plot,
+        "--floor": args.floor,
+        "--stages": args.stages,
+    }
+    for option, value in (with_table if args.table is None else with_files).items():
+        if value is not None and value is not False:
+            where = "--table" if args.table is None else "recordings; --table simulates its own"
+            raise ValueError(f"{option} goes with {where}")
+    if not args.files and args.table is None:
+        raise ValueError("what is to be judged? Give recordings, or --table synthetic")
+    if args.stages and args.report is not None:
+        raise ValueError("--stages goes with recordings alone; --table and --report hold it")
+    if args.stages and (args.plot is not None or args.floor):
+        raise ValueError("--stages judges flow and depth alone: --plot and --floor speak of velocities")
 
 
 def _sim(args: argparse.Namespace) -> int:

@@ -9,6 +9,7 @@ from dataclasses import asdict
 from typing import Any, TextIO
 
 from velod.cli.exit import RunFailed
+from velod.cli.values import count, not_negative, positive, seed
 
 
 def add_actions(actions: Any) -> None:
@@ -16,30 +17,30 @@ def add_actions(actions: Any) -> None:
     attacks = actions("attacks", "try what outsiders may try on a velod at work; a table of what happened")
     attacks.set_defaults(command=_attacks)
     fuzz = actions("fuzz", "give every decoder bad inputs that a coverage-guided fuzzer makes (atheris)")
-    fuzz.add_argument("--runs", type=int, default=100_000, help="inputs, over all decoders (default 100000)")
-    fuzz.add_argument("--seed", type=int, default=1, help="of the inputs (default 1)")
+    fuzz.add_argument("--runs", type=count, default=100_000, help="inputs, over all decoders (default 100000)")
+    fuzz.add_argument("--seed", type=seed, default=1, help="of the inputs (default 1)")
     fuzz.add_argument("--corpus", metavar="DIR", help="where to begin from, and to keep inputs that were of interest")
     fuzz.set_defaults(command=_fuzz)
     fleet = actions("fleet", "many simulated rigs through one router to one consumer: rate, latency, CPU")
-    fleet.add_argument("--rigs", type=int, default=100, help="how many (default 100)")
-    fleet.add_argument("--hz", type=float, default=75.0, help="velocities per second of each (default 75)")
-    fleet.add_argument("--seconds", type=float, default=10.0, help="default 10")
+    fleet.add_argument("--rigs", type=count, default=100, help="how many (default 100)")
+    fleet.add_argument("--hz", type=positive, default=75.0, help="velocities per second of each (default 75)")
+    fleet.add_argument("--seconds", type=positive, default=10.0, help="default 10")
     fleet.add_argument("--tls", action="store_true", help="with certificates, as between hosts")
     fleet.set_defaults(command=_fleet)
     soak = actions(
         "soak", "a velod at work for long, its workers killed and stopped at random: memory, files, latency"
     )
-    soak.add_argument("--seconds", type=float, default=1800.0, help="default 1800")
-    soak.add_argument("--fault-every", type=float, default=20.0, metavar="S", help="on average (default 20)")
-    soak.add_argument("--seed", type=int, default=1, help="of the faults (default 1)")
+    soak.add_argument("--seconds", type=positive, default=1800.0, help="default 1800")
+    soak.add_argument("--fault-every", type=positive, default=20.0, metavar="S", help="on average (default 20)")
+    soak.add_argument("--seed", type=seed, default=1, help="of the faults (default 1)")
     soak.set_defaults(command=_soak)
     scaling = actions("scaling", "throughput and latency against the number of flow workers; CPU and bytes by stage")
-    scaling.add_argument("--workers", type=int, default=3, help="from 1 to so many (default 3)")
+    scaling.add_argument("--workers", type=count, default=3, help="from 1 to so many (default 3)")
     scaling.add_argument(
-        "--load-ms", type=float, default=25.0, help="of artificial load on each batch of a flow worker (default 25)"
+        "--load-ms", type=not_negative, default=25.0, help="a flow worker sleeps so long on each batch (default 25)"
     )
-    scaling.add_argument("--speed", type=float, default=1.0, help="of playing, times real time (default 1)")
-    scaling.add_argument("--seconds", type=float, default=5.0, help="of corridor-1, simulated once (default 5)")
+    scaling.add_argument("--speed", type=positive, default=1.0, help="of playing, times real time (default 1)")
+    scaling.add_argument("--seconds", type=positive, default=5.0, help="of corridor-1, simulated once (default 5)")
     scaling.set_defaults(command=_scaling)
     for parser in (attacks, fuzz, fleet, soak, scaling):
         parser.add_argument("--json", metavar="OUT", help="write what was seen; - for stdout")

@@ -14,6 +14,7 @@ from velod import __version__
 from velod.cli.config import calibration_of, settings_of
 from velod.cli.exit import EXIT_FAILED, RunFailed
 from velod.cli.report import Line
+from velod.cli.values import require_writable
 from velod.cli.watch import Place, Way, place_of
 from velod.client import Listener, Received
 from velod.geometry.calibration import Calibration, CalibrationError, save_calibration
@@ -44,6 +45,7 @@ def record(
     path = Path(file)
     if path.exists():
         raise ValueError(f"{path}: exists already; velod overwrites no recording")
+    require_writable(file)
     chosen = _topics(path, topics)
     place = place_of(config, way, "operator")
     session = Session(place, chosen, seconds, stop_on_signals())

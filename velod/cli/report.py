@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import csv
-import errno
 import json
 import logging
 import math
-import os
 import shutil
 import sys
 import time
@@ -33,20 +31,6 @@ sensor time to publication; bridged_ms: how far the IMU carried the newest measu
 
 _REDRAW_S = 0.1
 _UPPER = np.triu_indices(3)
-
-
-def require_writable(*paths: str | None) -> None:
-    """Raise OSError where a file cannot be made, before the work whose result it is to hold; None and ``-`` pass."""
-    for path in paths:
-        if path is None or path == "-":
-            continue
-        folder = Path(path).absolute().parent
-        if Path(path).is_dir():
-            raise OSError(errno.EISDIR, os.strerror(errno.EISDIR), path)
-        if not folder.is_dir():
-            raise OSError(errno.ENOENT, os.strerror(errno.ENOENT), path)
-        if not os.access(path if Path(path).exists() else folder, os.W_OK):
-            raise OSError(errno.EACCES, os.strerror(errno.EACCES), path)
 
 
 @contextmanager

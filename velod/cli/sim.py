@@ -8,6 +8,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from velod.cli.values import seed
+
 if TYPE_CHECKING:
     from velod.sim import Sequence
 
@@ -38,7 +40,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="a pixel's light is the mean over K x K rays, not one at its centre (1 to 4, default 1): outlines then "
         "cross it gradually, as on a real sensor; K = 2 takes two to five times as long",
     )  # fmt: skip
-    parser.add_argument("--texture", type=int, metavar="SEED", help="other leaves on walls and boxes")
+    parser.add_argument("--texture", type=seed, metavar="SEED", help="other leaves on walls and boxes")
     parser.add_argument("--threshold", type=float, metavar="C", help="contrast at which pixels fire (default 0.5)")
     parser.add_argument(
         "--vibration",

@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 
 from velod.cli.network import way_of
-from velod.cli.options import Commands, add_watch_options, command, seconds
+from velod.cli.options import Commands, add_watch_options, command
+from velod.cli.values import count, port, positive
 
 
 def add_commands(commands: Commands) -> None:
@@ -29,9 +30,9 @@ def _add_echo(commands: Commands) -> None:
     )
     parser.add_argument("topic", nargs="?", default="velocity", metavar="TOPIC")
     add_watch_options(parser)
-    parser.add_argument("-n", "--count", type=int, metavar="N", help="stop after N messages")
+    parser.add_argument("-n", "--count", type=count, metavar="N", help="stop after N messages")
     parser.add_argument(
-        "--timeout", type=seconds, metavar="S", help="give up after S seconds without a message (default: never)"
+        "--timeout", type=positive, metavar="S", help="give up after S seconds without a message (default: never)"
     )
 
 
@@ -64,8 +65,8 @@ def _add_view(commands: Commands) -> None:
     )
     add_watch_options(parser)
     parser.add_argument("--save", metavar="FILE", help="write a recording for the viewer instead of opening it")
-    parser.add_argument("--seconds", type=seconds, metavar="S", help="stop after S seconds (default: never)")
-    parser.add_argument("--port", type=int, default=9876, help="of the viewer on loopback (default 9876)")
+    parser.add_argument("--seconds", type=positive, metavar="S", help="stop after S seconds (default: never)")
+    parser.add_argument("--port", type=port, default=9876, help="of the viewer on loopback (default 9876)")
 
 
 def _add_record(commands: Commands) -> None:
@@ -91,7 +92,7 @@ def _add_record(commands: Commands) -> None:
     parser.add_argument("topics", nargs="*", metavar="TOPIC", help="as for velod echo; with .mcap only")
     add_watch_options(parser)
     parser.add_argument("--calibration", metavar="FILE", help="to put into the file, instead of the service's own")
-    parser.add_argument("--seconds", type=seconds, metavar="S", help="stop after S seconds (default: never)")
+    parser.add_argument("--seconds", type=positive, metavar="S", help="stop after S seconds (default: never)")
 
 
 def _add_odometry(commands: Commands) -> None:

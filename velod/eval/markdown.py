@@ -20,12 +20,18 @@ def put_into(
 
     Raises MarkdownError where the file has no such place, OSError where it cannot be read or written.
     """
-    path = Path(path)
-    text, begin = path.read_text(encoding="utf-8"), f"<!-- {command} -->"
-    place = re.compile(re.escape(begin) + r".*?<!-- end -->", re.DOTALL)
-    if not place.search(text):
-        raise MarkdownError(f"{path}: there is no place for these tables: {begin} ... <!-- end -->")
+    text, begin = Path(path).read_text(encoding="utf-8"), f"<!-- {command} -->"
+    place = require_place(path, command)
     blocks = "\n\n".join(f"{title}\n{text_table(lines)}" for title, lines in tables.items())
     said = "\n".join(notes)
     block = f"{begin}\n`{command}` at `{commit}`:\n\n```\n{blocks}\n\n{said}\n```\n<!-- end -->"
-    path.write_text(place.sub(lambda _: block, text), encoding="utf-8")
+    Path(path).write_text(place.sub(lambda _: block, text), encoding="utf-8")
+
+
+def require_place(path: str | Path, command: str) -> re.Pattern[str]:
+    """What matches the place of a command's tables. Raises MarkdownError, OSError as ``put_into`` does."""
+    begin = f"<!-- {command} -->"
+    place = re.compile(re.escape(begin) + r".*?<!-- end -->", re.DOTALL)
+    if not place.search(Path(path).read_text(encoding="utf-8")):
+        raise MarkdownError(f"{path}: there is no place for these tables: {begin} ... <!-- end -->")
+    return place

@@ -148,8 +148,10 @@ def _read_yaml(path: Path) -> dict[str, Any]:
         tree = yaml.safe_load(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise CalibrationError(f"{path}: no such file") from None
-    except (OSError, UnicodeDecodeError) as e:
-        raise CalibrationError(f"{path}: cannot be read: {e}") from None
+    except OSError as e:
+        raise CalibrationError(f"{path}: cannot be read: {e.strerror}") from None
+    except UnicodeDecodeError:
+        raise CalibrationError(f"{path}: cannot be read: not text in UTF-8") from None
     except yaml.YAMLError as e:
         raise CalibrationError(f"{path}: not plain YAML: {' '.join(str(e).split())}") from None
     if not isinstance(tree, dict):

@@ -16,6 +16,7 @@ from velod.sim.effects import Readout
 from velod.sim.event_camera import BLOCK_STEPS, MAX_MOTION_PX, STEPS, EventCamera
 from velod.sim.imu import sample_imu
 from velod.sim.recipe import BASELINE_M, Sequence
+from velod.sim.sequences import SequenceError
 from velod.sim.texture import make_texture
 from velod.sim.trajectory import Trajectory
 from velod.types import F32, F64
@@ -36,10 +37,13 @@ def simulate(
 ) -> None:
     """Write ``seconds`` of ``sequence`` to ``path``; on one machine equal arguments give equal bytes.
 
-    The two cameras are rendered in two threads. Raises RecordingError where the file cannot be written.
+    The two cameras are rendered in two threads. Raises SequenceError for less than a microsecond, RecordingError
+    where the file cannot be written.
     """
     imu_rng, left_rng, right_rng, *clock_rngs = (np.random.default_rng((seed, k)) for k in range(5))
     end_us = round(seconds * 1e6)
+    if end_us < 1:
+        raise SequenceError(f"{seconds:g} s are less than a microsecond")
     depths: list[F32] = []
     effects = sequence.effects
     left, right = (
