@@ -389,6 +389,16 @@ def test_every_batch_ends_after_all_that_was_promised_before_it() -> None:
     assert promised > sent
 
 
+def test_before_time_zero_nothing_is_promised_that_has_not_come() -> None:
+    ingest, e = stage(), edges(seconds=0.05)
+    past = 2 * T0_NS
+    e = Events(e.x, e.y, e.t_ns - past, e.p)
+    out = [*ingest.handle(imu_packet(0, [T0_NS - past])), *both(ingest, e, T0_NS - past + 50 * MS)]
+    words = [m for m in out if isinstance(m, ImuSamples)]
+    assert words[0].event_t_ns == 0  # nothing heard
+    assert len(words) > 3 and all(m.event_t_ns < 0 and m.batch_t_ns < 0 for m in words[1:])
+
+
 def test_events_that_pass_an_output_are_told_of_at_once() -> None:
     """So that the optimizer knows without waiting for the next samples that no batch ended before its output."""
     ingest, output_ns = stage(period_ms=20.0), 76 * NS_PER_S // 75

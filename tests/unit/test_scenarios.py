@@ -163,6 +163,15 @@ def test_a_jump_of_the_clock_starts_the_estimate_anew(by_s):
     assert np.mean(right) < USUAL_ERROR
 
 
+def test_times_before_zero_are_times_as_any():
+    """A recording whose clock is zero at its trigger: the same states at the same moments, as accurate."""
+    usual, _ = run(messages(FLIGHT, 1.5))
+    before, stage = run(delayed(messages(FLIGHT, 1.5), -1.0, -1.2))
+    assert [(v.t_ns + 1_200_000_000, v.state) for v in before] == [(v.t_ns, v.state) for v in usual]
+    assert np.allclose([v.v_B for v in before], [v.v_B for v in usual], atol=0.05)
+    assert "imu.backwards" not in stage.counters
+
+
 def test_cameras_mounted_otherwise_than_the_calibration_says_are_noticed():
     """T_cam_imu wrong by 90 degrees: never valid. By 10: mostly not called tracking, though nothing else tells."""
     for degrees, most_tracking in ((90.0, 0.0), (10.0, 0.35)):

@@ -26,7 +26,7 @@ class ImuStream:
         self, settings: IngestSettings, time_offset_s: float, counters: Counter[str], alarms: dict[str, str]
     ) -> None:
         self.order: PacketOrder[ImuPacket] = PacketOrder(counters)
-        self.t_ns = 0  # camera clock, of the last good sample; 0: none yet
+        self.t_ns = NEVER  # camera clock, of the last good sample
         self._last_ns = NEVER
         self._offset_ns = round(time_offset_s * NS_PER_S)
         self._max_frozen = settings.imu_frozen_samples

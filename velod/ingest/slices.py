@@ -11,7 +11,7 @@ import numpy as np
 from velod.config import Settings
 from velod.events.causal import all_open, enter_and_select, split_ages
 from velod.events.plane_fit import SIZE, WIDE_SIZE
-from velod.events.sae import new_surface
+from velod.events.sae import NEVER, new_surface
 from velod.events.selection import cell_side_px
 from velod.ingest.batch import OpenBatch
 from velod.ingest.budget import Budget
@@ -49,13 +49,13 @@ class Slices:
         self._open_ns = all_open(int(self._row_cell[-1]) + 1, int(self._column_cell[-1]) + 1)
         self._end_ns: int | None = None  # of the slice that has begun
         self._n_events = 0  # that went in since the last slice came out
-        self._t_start_ns = -1  # of the batch; -1: it has not begun
+        self._t_start_ns = NEVER  # of the batch; NEVER: it has not begun
         self.begin_batch()
 
     def begin_batch(self) -> int:
         """Forget what was selected; returns when the batch began of which it was."""
         self._n = self._sent = 0
-        t_start_ns, self._t_start_ns = self._t_start_ns, -1
+        t_start_ns, self._t_start_ns = self._t_start_ns, NEVER
         return t_start_ns
 
     @property
@@ -135,7 +135,7 @@ class Slices:
         self._sent = self._n
         p, y, x = self._at[new].T
         age, patch, ring = self._ages(new, t_end_ns)
-        if self._t_start_ns < 0:
+        if self._t_start_ns == NEVER:
             assert batch.t_start_ns is not None
             self._t_start_ns = batch.t_start_ns
         return EventBatch(

@@ -13,7 +13,7 @@ import numpy as np
 
 from velod.config import Settings
 from velod.events.plane_fit import SIZE
-from velod.events.sae import age_unit_ns, encode_ages, encode_newest, gather_patches, new_surface
+from velod.events.sae import NEVER, age_unit_ns, encode_ages, encode_newest, gather_patches, new_surface
 from velod.events.selection import select_burst, select_paper
 from velod.events.sensor_size import for_sensor
 from velod.events.time_noise import TimeNoise
@@ -78,8 +78,8 @@ class IngestStage:
         self._open = OpenBatch(s)
         # The paper's rules know nothing of it.
         self._time_noise = TimeNoise(self._settings.flow) if s.selection == "burst" else None
-        self._batch_t_ns = 0
-        self._told_ns = 0  # how far the events had come by the newest word
+        self._batch_t_ns = NEVER
+        self._told_ns = NEVER  # how far the events had come by the newest word
         if self._slices is not None:
             # Parts of a batch that will never be whole must not join another one.
             self._batch_seq += self._slices.has_sent
@@ -123,14 +123,14 @@ class IngestStage:
             self.counters["clock.restart"] += 1
             self._start_epoch()
             taken = self._imu.take(packet)
-        return [self._imu_samples(*samples) for samples in taken]
+        return [self._imu_samples(self._event_t_ns, *samples) for samples in taken]
 
-    def _imu_samples(self, t_ns: I64, accel: F64, gyro: F64) -> ImuSamples:
+    def _imu_samples(self, event_t_ns: int, t_ns: I64, accel: F64, gyro: F64) -> ImuSamples:
+        """With word of how far the events have come; a time of which nothing has been heard is said as 0."""
         self._imu_seq += 1
-        self._told_ns = event_t_ns = self._event_t_ns
-        return ImuSamples(
-            self._imu_seq, self._imu.t_ns, event_t_ns, self._batch_seq, self._batch_t_ns, t_ns, accel, gyro
-        )
+        self._told_ns = event_t_ns
+        newest, events, batch = (0 if t == NEVER else t for t in (self._imu.t_ns, event_t_ns, self._batch_t_ns))
+        return ImuSamples(self._imu_seq, newest, events, self._batch_seq, batch, t_ns, accel, gyro)
 
     @property
     def _event_t_ns(self) -> int:
@@ -144,8 +144,8 @@ class IngestStage:
 
         With the next samples of the IMU it would come late by so much.
         """
-        told, now = (int(t_ns * self._output_hz / NS_PER_S) for t_ns in (self._told_ns, self._event_t_ns))
-        return [self._no_samples(self._event_t_ns)] if now > told and self._imu.t_ns > 0 else []
+        told, now = (t_ns * self._output_hz // NS_PER_S for t_ns in (self._told_ns, self._event_t_ns))
+        return [self._no_samples(self._event_t_ns)] if now > told and self._imu.t_ns != NEVER else []
 
     def _close_batches(self) -> list[Output]:
         out: list[Output] = []
@@ -273,9 +273,5 @@ class IngestStage:
 
     def _no_samples(self, event_t_ns: int) -> ImuSamples:
         """Tells the optimizer how far the events have come without waiting for the IMU."""
-        self._imu_seq += 1
-        self._told_ns = event_t_ns
-        none, no_rows = np.empty(0, np.int64), np.empty((0, 3))
-        return ImuSamples(
-            self._imu_seq, self._imu.t_ns, event_t_ns, self._batch_seq, self._batch_t_ns, none, no_rows, no_rows
-        )
+        no_rows = np.empty((0, 3))
+        return self._imu_samples(event_t_ns, np.empty(0, np.int64), no_rows, no_rows)

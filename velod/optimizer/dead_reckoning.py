@@ -10,6 +10,7 @@ import math
 import numpy as np
 from numba import njit
 
+from velod.events.sae import NEVER
 from velod.geometry.so3 import exp_so3, quaternion_so3
 from velod.optimizer.small import add_sandwich, multiply
 from velod.types import F64, NS_PER_S, Odometry
@@ -28,7 +29,7 @@ class DeadReckoning:
 
     def stop(self) -> None:
         """The velocity is lost: the next one begins a new reckoning."""
-        self._t_ns = -1
+        self._t_ns = NEVER
 
     def update(self, t_ns: int, v_B: F64, cov: F64, R_LB: F64, g_B: F64, tilt_cov: F64 = NO_TILT) -> Odometry:
         """Reckon up to ``t_ns``, later than the last one.
@@ -36,7 +37,7 @@ class DeadReckoning:
         ``v_B`` (3,) m/s with ``cov`` (3, 3); ``R_LB`` (3, 3): attitude in any frame that only the gyroscope carries;
         ``g_B`` (3,): gravity, as specific force, upwards; ``tilt_cov`` (3, 3): of its direction in B, rad^2.
         """
-        if self._t_ns < 0:
+        if self._t_ns == NEVER:
             self._begin(t_ns, v_B, R_LB, g_B, tilt_cov)
         else:
             self._go_on(t_ns, v_B, cov, R_LB, g_B, tilt_cov)

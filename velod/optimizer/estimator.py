@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from velod.config import ImuSettings, Settings
+from velod.events.sae import NEVER
 from velod.events.sensor_size import for_sensor
 from velod.geometry.calibration import Calibration
 from velod.geometry.rectify import rectified_pair
@@ -119,13 +120,12 @@ class Estimator:
         )  # fmt: skip
         self.head: Head | None = None
         self.batches = 0  # that gave a velocity
-        self.first_usable_t_ns = -1
-        self.last_usable_t_ns = 0
+        self.first_usable_t_ns = self.last_usable_t_ns = NEVER
         self.own_solution: tuple[int, F64, F64] | None = None  # end of the newest batch with one, s_L there, its e
         self._open: list[Interval] = []  # that may get flows yet; the last one is incomplete
         self._started_ns = 0
         self._depth_m = USUAL_DEPTH  # median of the newest batch
-        self._still_to = 0  # up to here rest has been observed
+        self._still_to = NEVER  # up to here rest has been observed
         self._weak_L: F64 = np.empty((0, 3))  # directions that the newest batch with flow does not constrain
         self.lacking = "no events"  # why the newest batch gave no velocity
         # t_ns -> the IMU up to there and the prediction, from the head ``_carried_from``
@@ -431,7 +431,7 @@ class Estimator:
 
     def _note_usable(self, t_ns: int) -> None:
         self.batches += 1
-        self.first_usable_t_ns = t_ns if self.first_usable_t_ns < 0 else self.first_usable_t_ns
+        self.first_usable_t_ns = t_ns if self.first_usable_t_ns == NEVER else self.first_usable_t_ns
         self.last_usable_t_ns = max(self.last_usable_t_ns, t_ns)
 
     def _slope(self) -> F64:

@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from velod.config import ImuSettings
+from velod.events.sae import NEVER
 from velod.optimizer.inertial import InertialMemory
 from velod.types import F64, NS_PER_S
 
@@ -42,7 +43,7 @@ class ImuNoise:
 
     def __init__(self, specified: ImuSettings) -> None:
         self.settings = self._specified = specified
-        self._next_ns = 0
+        self._next_ns = NEVER
         self._held: deque[tuple[F64, F64]] = deque(maxlen=HELD)
 
     def look(self, memory: InertialMemory, t_ns: int) -> bool:

@@ -70,4 +70,4 @@ class Parts:
 
 def _of_one_batch(a: FlowBatch | DepthBatch, b: FlowBatch | DepthBatch) -> bool:
     """Whether two parts of one number belong together; those of an older velod do not say when their batch began."""
-    return a.t_ns == b.t_ns if min(a.t_start_ns, b.t_start_ns) < 0 else a.t_start_ns == b.t_start_ns
+    return a.t_ns == b.t_ns if -1 in (a.t_start_ns, b.t_start_ns) else a.t_start_ns == b.t_start_ns

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from velod.config import Settings
+from velod.events.sae import NEVER
 from velod.events.sensor_size import for_sensor
 from velod.geometry.calibration import Calibration
 from velod.optimizer.attitude import Attitude
@@ -90,13 +91,13 @@ class OptimizerStage:
         self._estimator = Estimator(self._settings, self._calibration)
         self._estimator.counters = self.counters
         self._forget_batches()
-        self._imu_t_ns = -1  # newest sample
-        self._event_t_ns = 0
-        self._now_ns = 0  # newest sensor time heard of
-        self._tick = -1  # number of the next velocity on the grid of the output rate
+        self._imu_t_ns = NEVER  # newest sample
+        self._event_t_ns = NEVER
+        self._now_ns = NEVER  # newest sensor time heard of
+        self._tick = NEVER  # number of the next velocity on the grid of the output rate
         self._was_valid = self._was_lost = False
         self._newest = (-1, 0)  # seq and t_ns of the newest batch taken in
-        self._silent_to = 0  # without an event since the newest batch
+        self._silent_to = NEVER  # without an event since the newest batch
 
     def handle(self, message: FlowBatch | DepthBatch | ImuSamples) -> list[Velocity | Odometry]:
         """Take one message; return the velocities that it completes, a valid one with its dead reckoning.
@@ -150,7 +151,7 @@ class OptimizerStage:
         for seq in range(max(self._closed_seq + 1, self._next_seq), m.batch_seq + 1):
             self._ends[seq] = m.batch_t_ns  # exact for the newest, the latest possible for one not heard of
         self._closed_seq = m.batch_seq
-        self._event_t_ns = max(self._event_t_ns, m.event_t_ns)
+        self._event_t_ns = max(self._event_t_ns, m.event_t_ns or NEVER)
         self._append_samples(m)
 
     def _forget_batches(self) -> None:
@@ -163,7 +164,7 @@ class OptimizerStage:
 
     def _append_samples(self, m: ImuSamples) -> None:
         t_ns = m.sample_t_ns
-        if self._imu_t_ns >= 0 and self._tick >= 0 and continues(t_ns, self._imu_t_ns, IMU_GAP_NS):
+        if self._tick != NEVER and continues(t_ns, self._imu_t_ns, IMU_GAP_NS):
             self._estimator.add_imu(m)
             self._imu_t_ns = int(t_ns[-1])
         elif len(t_ns):
@@ -177,7 +178,7 @@ class OptimizerStage:
         if not new.any():
             return
         t, accel, gyro = m.sample_t_ns[new], m.accel[new], m.gyro[new]
-        before = t[0] if self._imu_t_ns < 0 else self._imu_t_ns
+        before = t[0] if self._imu_t_ns == NEVER else self._imu_t_ns
         holes = np.flatnonzero(np.diff(t, prepend=before) > IMU_GAP_NS).tolist()
         for first, end in pairwise(sorted({0, *holes, len(t)})):
             if first in holes:
@@ -185,7 +186,7 @@ class OptimizerStage:
                 self._restart_after_gap()
             part = slice(first, end)
             self._estimator.add_imu(replace(m, sample_t_ns=t[part], accel=accel[part], gyro=gyro[part]))
-            if self._tick < 0 and end > first:
+            if self._tick == NEVER and end > first:
                 self._tick = self._tick_after(int(t[first]) - 1)
         self._imu_t_ns = int(t[-1])
 
@@ -195,7 +196,7 @@ class OptimizerStage:
         self._estimator = Estimator(self._settings, self._calibration, check)
         self._estimator.counters = self.counters
         self._was_valid, self._was_lost = False, self._was_valid or self._was_lost
-        self._tick = -1
+        self._tick = NEVER
 
     def _tick_ns(self, k: int) -> int:
         return k * NS_PER_S // int(self._hz) if self._hz.is_integer() else int(k * (NS_PER_S / self._hz))
@@ -209,7 +210,7 @@ class OptimizerStage:
     def _advance(self) -> list[Velocity | Odometry]:
         """Everything that can be done now, in sensor-time order."""
         out: list[Velocity | Odometry] = []
-        while self._tick >= 0:
+        while self._tick != NEVER:
             tau = self._tick_ns(self._tick)
             complete = self._take_in_order(tau)
             if self._imu_t_ns < tau:
@@ -249,7 +250,7 @@ class OptimizerStage:
 
         An event opens a batch, and a batch ends within a period: all those that ended by ``tau`` have been taken in.
         """
-        if self._silence_ns is None or self._newest[1] == 0:
+        if self._silence_ns is None or self._newest[0] < 0:
             return
         t_ns = tau - self._silence_ns
         if t_ns >= max(self._newest[1], self._silent_to) + self._silence_ns:
@@ -299,7 +300,7 @@ class OptimizerStage:
             _Unchecked(flow, depth, own if own is not None and own[0] == flow.t_ns else None, offsets)
         )
         self._check_noise()
-        if flow.t_ns > self._newest[1]:
+        if self._newest[0] < 0 or flow.t_ns > self._newest[1]:
             self._newest = (seq, flow.t_ns)
 
     def tidy(self) -> None:

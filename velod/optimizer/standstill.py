@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from velod.config import ImuSettings
+from velod.events.sae import NEVER
 from velod.optimizer.bias_prior import IMPLAUSIBLE
 from velod.optimizer.inertial import InertialMemory
 from velod.types import F64, FlowBatch
@@ -47,9 +48,9 @@ class Standstill:
     def __init__(self, imu: ImuSettings, pixels: int) -> None:
         """``pixels``: of the left sensor."""
         self.imu, self._pixels = imu, pixels
-        self._t_ns = -1
+        self._t_ns = NEVER
         self._event_hz = 0.0  # per pixel, in the newest batch
-        self._quiet_since_ns = -1
+        self._quiet_since_ns = NEVER
         self.dark = False
         self._rests = False  # at the end of the newest batch
 
@@ -77,10 +78,10 @@ class Standstill:
     def _detected(self, flow: FlowBatch, memory: InertialMemory, b_w: F64, predicted: tuple[F64, F64] | None) -> bool:
         self._note_events(flow)
         if flow.n_selected >= QUIET_EVENTS or self._event_hz > MAX_EVENT_HZ:
-            self._quiet_since_ns = -1
+            self._quiet_since_ns = NEVER
             self.dark = False
             return False
-        if self._quiet_since_ns < 0:
+        if self._quiet_since_ns == NEVER:
             self._quiet_since_ns = flow.t_ns
         start = flow.t_ns - QUIET_NS
         if self._quiet_since_ns > start or not memory.covers(start, flow.t_ns):
@@ -93,7 +94,7 @@ class Standstill:
 
     def _note_events(self, flow: FlowBatch) -> None:
         span_s = (flow.t_ns - self._t_ns) * 1e-9
-        known = self._t_ns >= 0 and span_s > 0.0 and flow.n_events >= 0
+        known = self._t_ns != NEVER and span_s > 0.0 and flow.n_events >= 0
         self._event_hz = flow.n_events / self._pixels / span_s if known else MAX_EVENT_HZ
         self._t_ns = flow.t_ns
 
