@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from velod.config import IngestSettings
-from velod.runtime.imu_bridge import SILENT_S, ImuBridge
+from velod.runtime import imu_bridge
+from velod.runtime.imu_bridge import AGAIN_NS, KEPT, SILENT_S, ImuBridge
 from velod.types import ImuPacket, ImuSamples
-from velod.wire import encode
+from velod.wire import decode, encode
 
 STEP_NS = 5_000_000
 START_NS = 1_000_000_000_000
@@ -65,6 +66,19 @@ def test_every_sample_is_handed_over_once_and_in_order_whatever_ingest_does(seed
     t_ns = np.concatenate([samples.sample_t_ns for samples in handed])
     assert np.array_equal(t_ns, START_NS - round(OFFSET_S * 1e9) + STEP_NS * np.arange(400))
     assert b.counters["bridge.begun"] > 0
+
+
+def test_a_silence_of_ingest_costs_no_look_at_all_that_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    looked_at = []
+    monkeypatch.setattr(imu_bridge, "decode", lambda data, kind: looked_at.append(data) or decode(data, kind))
+    b, n = bridge(), KEPT + 100
+    for i in range(n):
+        b.keep(encode(packet(i), 0))
+        b.from_ingest(from_ingest(i), i * STEP_NS * 1e-9)
+    assert not looked_at
+    b.keep(encode(packet(n), 0))
+    assert values(b.due(1e9)) == [float(n)]
+    assert len(looked_at) <= AGAIN_NS // STEP_NS + 2
 
 
 def test_ingest_is_waited_for_a_moment_and_its_last_word_on_the_events_stands() -> None:

@@ -16,13 +16,15 @@ import numpy as np
 from velod.config import IngestSettings
 from velod.ingest.imu import ImuStream
 from velod.ingest.ordering import CLOCK_RESTART_NS, ClockRestart
-from velod.types import F64, I64, ImuPacket, ImuSamples
-from velod.wire import WireError, decode
+from velod.types import F64, I64, NS_PER_S, ImuPacket, ImuSamples
+from velod.wire import WireError, decode, peek
 
 SILENT_S: Final = 0.05
 """Without samples from ingest for so long it is not waited for: as long as the optimizer waits for a batch."""
 KEPT: Final = 512
 """Packets of the sensor, half a second of single samples at 1 kHz: ingest may be behind when it dies."""
+AGAIN_NS: Final = 100_000_000
+"""So much of what was handed over already is looked at once more, for checks that go over several samples."""
 
 
 class ImuBridge:
@@ -71,8 +73,19 @@ class ImuBridge:
 
     def _begin(self) -> None:
         if self._stream is None:
+            while self._packets and self._is_past(self._packets[0]):
+                self._packets.popleft()
             self._stream = ImuStream(self._settings, self._time_offset_s, Counter(), {})
             self._counted = False
+
+    def _is_past(self, data: bytes) -> bool:
+        """Whether a packet is of no use any more. Hundreds are kept: to check all would make a gap of its own."""
+        try:
+            t_ns = peek(data, "t_ns")
+        except WireError:
+            return False
+        end_ns = self._t_ns + round(self._time_offset_s * NS_PER_S)
+        return isinstance(t_ns, int) and end_ns - CLOCK_RESTART_NS < t_ns < end_ns - AGAIN_NS
 
     def _from_sensor(self, before_ns: int | None = None) -> list[ImuSamples]:
         """New samples of the packets kept, as if ingest had sent them without any word of events."""

@@ -12,9 +12,10 @@ import re
 import socket
 import struct
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
-from typing import Final
+from threading import Thread
+from typing import Any, Final
 
 import zenoh
 
@@ -25,6 +26,8 @@ and all those behind it, for longer than it is of use; its other means need late
 _TCP_RTO_MIN_US: Final = 45  # linux/tcp.h since 6.15; Python has no name for it
 _NO_LINGER: Final = struct.pack("ii", 0, 0)
 _FILES: Final = "/proc/self/fd"
+_EVENTS: Final = 4096
+"""That may wait to be looked at: far more than a process has links."""
 _LOCATOR = re.compile(r"(?:tcp|tls)/\[?(?P<host>[^\]]+?)\]?:(?P<port>\d+)(?:[?#].*)?")
 
 
@@ -37,12 +40,27 @@ def keep_from_blocking(session: zenoh.Session) -> None:
         if event.kind == zenoh.SampleKind.PUT:
             set_options(event.link.src, event.link.dst)
 
-    callback = zenoh.handlers.Callback(changed, indirect=False)
-    session.info.declare_link_events_listener(callback, history=True)
+    follow(session, changed, history=True)
+
+
+def follow(session: zenoh.Session, changed: Callable[[zenoh.LinkEvent], None], *, history: bool = False) -> None:
+    """Call ``changed`` for every link that comes or goes as long as ``session`` is open; with ``history`` also for
+    those that are there.
+
+    In a thread of its own: Zenoh reports links from a thread that receives for others, and would keep them waiting
+    for as long as Python takes, which is 0.1 s where the interpreter is busy.
+    """
+    listener = session.info.declare_link_events_listener(zenoh.handlers.FifoChannel(_EVENTS), history=history)
+    Thread(target=_call_for_each, args=(listener, changed), name="links", daemon=True).start()
+
+
+def _call_for_each(listener: Any, changed: Callable[[zenoh.LinkEvent], None]) -> None:
+    for event in listener:  # until the session is closed
+        changed(event)
 
 
 def set_options(src: str, dst: str) -> int:
-    """Set the options of this process's sockets from locator ``src`` to ``dst``; returns how many there are."""
+    """Set the options of this process's socket from locator ``src`` to ``dst``; returns how many there are."""
     found = 0
     for link in _sockets_between(src, dst):
         link.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _NO_LINGER)
@@ -66,7 +84,7 @@ def cut(session: zenoh.Session, peer: str) -> None:
 
 
 def _sockets_between(src: str, dst: str) -> Iterator[socket.socket]:
-    """Duplicates of this process's sockets from locator ``src`` to ``dst``, each open for one round of a loop."""
+    """A duplicate of this process's socket from locator ``src`` to ``dst``, open for one round of a loop."""
     ends = (_address(src), _address(dst))
     if None in ends:
         return  # a link of another kind
@@ -74,6 +92,7 @@ def _sockets_between(src: str, dst: str) -> Iterator[socket.socket]:
         with link:
             if ends == _ends(link):
                 yield link
+                return
 
 
 def _address(locator: str) -> tuple[str, int] | None:
@@ -90,7 +109,7 @@ def _ends(link: socket.socket) -> tuple[tuple[str, int], tuple[str, int]] | None
 
 def _tcp_sockets() -> Iterator[socket.socket]:
     """Duplicates of this process's TCP sockets, to be closed."""
-    for name in os.listdir(_FILES):
+    for name in sorted(os.listdir(_FILES), key=int, reverse=True):  # a link that is looked for is a new one
         try:
             if not os.readlink(f"{_FILES}/{name}").startswith("socket:"):
                 continue

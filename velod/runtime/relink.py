@@ -19,7 +19,7 @@ from typing import Final
 
 import zenoh
 
-from velod.runtime.links import cut
+from velod.runtime.links import cut, follow
 from velod.wire.topics import LINKED
 
 log = logging.getLogger("velod")
@@ -48,7 +48,7 @@ def keep_linked(session: zenoh.Session) -> None:
         if event.kind == zenoh.SampleKind.DELETE:
             relinker.lost(str(event.link.zid))
 
-    session.info.declare_link_events_listener(zenoh.handlers.Callback(changed, indirect=False))
+    follow(session, changed)
 
 
 class _Relinker:
@@ -60,7 +60,7 @@ class _Relinker:
         self._looks = False
 
     def lost(self, peer: str) -> None:
-        """The link to ``peer`` has ended. Returns at once: the network's threads are not to wait."""
+        """The link to ``peer`` has ended."""
         with self._lock:
             self._tries[peer] = 0
             if not self._looks:

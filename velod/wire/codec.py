@@ -141,6 +141,11 @@ def decode(
     return Envelope(message=message, **times)
 
 
+def peek(data: bytes, name: str) -> Any:
+    """One value of a message, as it was sent and unchecked; None where there is none. Raises WireError for no map."""
+    return _unpack(data).get(name)
+
+
 @cache
 def _host_times() -> tuple[Field, ...]:
     return tuple(f for f in schema("Envelope").fields if f.name.startswith("t_"))
