@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -80,6 +82,44 @@ def test_what_only_one_camera_sees_gets_no_confident_depth() -> None:
     found[out.index] = True
     # Half of the points are beside a jump or at an edge that has not passed their neighbourhood.
     assert found[hidden].mean() < 0.15 < 0.4 < found[~hidden].mean()
+
+
+def outline_before(wall: list[Edge]) -> StereoBatch:
+    """The ON outline of something near, disparity 20, before a wall of OFF edges."""
+    message, rect = (
+        batch(Edge(x_px=170.0, angle=0.1, speed_px_s=300.0, disparity_px=20.0), points=100),
+        rectify(PLAIN_RIG),
+    )
+    off = [
+        surface(wall, xy, right=right, jitter_s=0.0, seed=1)
+        for right, xy in ((False, rect.left_xy), (True, rect.right_xy))
+    ]
+    left, right = (np.stack([o, both[1]]) for o, both in zip(off, (message.left, message.right), strict=True))
+    return replace(message, left=left, right=right)
+
+
+def test_an_outline_before_a_busy_background_owns_up_in_its_sigma() -> None:
+    """It is found, and where; but what surrounds it is at another distance, and moves in another way."""
+    wall = [Edge(x_px=60.0 + 5.0 * k, angle=0.4, speed_px_s=90.0, disparity_px=6.5) for k in range(40)]
+    (busy,), (blank,) = (DepthStage(Settings(), PLAIN_RIG).handle(outline_before(w)) for w in (wall, []))
+    for out in (busy, blank):
+        assert len(out.index) > 60
+        np.testing.assert_allclose(out.disparity, 20.0, atol=0.05)
+    assert np.mean(busy.sigma * F_B > 5.0) > 0.8
+    assert np.max(blank.sigma * F_B) < 0.1
+
+
+def test_something_that_moves_by_itself_has_the_depth_at_which_it_is() -> None:
+    """Its flow is another one; both cameras see it at the same time all the same."""
+    still = [Edge(x_px=40.0 + 37.0 * k, angle=0.3, speed_px_s=120.0, disparity_px=6.0) for k in range(6)]
+    own = Edge(x_px=150.0, angle=-0.4, speed_px_s=500.0, disparity_px=11.0)
+    message = batch(*still, own, points=400)
+    passed_s = 1e-9 * message.age
+    moving = np.abs(passed_s - own.age_s(message.x.astype(float), message.y.astype(float))) < 1e-5
+    (out,) = DepthStage(Settings(), PLAIN_RIG).handle(message)
+    assert gross(out, np.where(moving, 11.0, 6.0)).sum() <= 0.01 * len(moving)
+    # The others are where both kinds of edges cross.
+    assert np.isin(np.flatnonzero(moving), out.index).sum() > 40
 
 
 def test_an_object_that_moves_by_itself_has_no_weight_in_the_velocity() -> None:

@@ -8,7 +8,7 @@ from scipy.ndimage import map_coordinates
 
 from tests.moving_edge import PLAIN_RIG, Edge, batch, without_right
 from velod.depth import refine as module
-from velod.depth.refine import OUTCOMES, Refined, refine
+from velod.depth.refine import OUTCOMES, Edges, Refined, left_edges, refine
 from velod.events.plane_fit import fit_plane, widen_plane
 from velod.geometry import so3
 from velod.geometry.calibration import Calibration, Camera
@@ -19,9 +19,15 @@ RADTAN = Camera(240, 180, 201.0, 200.0, 118.0, 91.0, "radtan", (-0.3, 0.1, 0.001
 TILTED_RIG = Calibration(RADTAN, RADTAN, so3.exp([0.01, -0.02, 0.015]), np.array([-0.1, 0.002, -0.001]))
 
 
+def edges_of(message: StereoBatch, rect: Rectification) -> Edges:
+    return left_edges(message.left, message.unit_ns, message.x, message.y, message.p, rect)
+
+
 def refine_batch(message: StereoBatch, rect: Rectification, seed_px: float | np.ndarray) -> Refined:
-    seeds = np.broadcast_to(np.float32(seed_px), message.x.shape).astype(np.float32)
-    return refine(message.left, message.right, message.unit_ns, message.x, message.y, message.p, seeds, rect)
+    """One seed for each point."""
+    seeds = np.broadcast_to(np.float64(seed_px), message.x.shape)
+    of = np.arange(len(message.x))
+    return refine(edges_of(message, rect), message.right, message.unit_ns, message.p, of, seeds, rect)
 
 
 def outcomes(result: Refined) -> set[str]:
@@ -100,11 +106,13 @@ def test_a_coarse_match_farther_off_is_refused(error_px: float) -> None:
 
 
 def test_the_normal_and_the_sigma_are_those_of_the_edge() -> None:
-    result = refine_batch(batch(Edge(angle=0.6), jitter_s=0.15 / 300.0), rectify(PLAIN_RIG), 7.37)
+    rect, message = rectify(PLAIN_RIG), batch(Edge(angle=0.6), jitter_s=0.15 / 300.0)
+    edges, result = edges_of(message, rect), refine_batch(message, rect, 7.37)
     good = result.outcome == module.REFINED
     assert good.sum() > 100
     # The edge moves to larger x, so the time of passage grows that way.
-    assert np.median(result.normal_x[good]) == pytest.approx(np.cos(0.6), abs=0.02)
+    normal_x = edges.slope_x / np.hypot(edges.slope_x, edges.slope_y)
+    assert np.median(normal_x[good]) == pytest.approx(np.cos(0.6), abs=0.02)
     # Two planes of 49 neighbours with what is usual of their residuals, inflated; the scatter is that of white ones.
     assert np.median(result.sigma_px[good]) == pytest.approx(1.1 * 0.15 * np.sqrt(2 / 49) / np.cos(0.6), rel=0.1)
     assert np.std(result.disparity[good]) == pytest.approx(np.median(result.sigma_px[good]) / 1.1, rel=0.25)
@@ -115,6 +123,17 @@ def test_an_edge_in_the_row_an_absent_one_and_a_missing_seed_are_told_apart() ->
     assert outcomes(refine_batch(batch(Edge(angle=1.5, x_px=400.0)), rect, 7.37)) == {"flat_edge"}
     assert outcomes(refine_batch(without_right(batch(Edge())), rect, 7.37)) == {"no_right_plane"}
     assert outcomes(refine_batch(batch(Edge()), rect, np.nan)) == {"no_seed"}
+
+
+def test_seeds_of_one_edge_are_refined_each_by_itself() -> None:
+    rect, message = rectify(PLAIN_RIG), batch(Edge(), points=20)
+    of = np.repeat(np.arange(20), 3)
+    seeds = np.tile([np.nan, 7.0, 12.0], 20)
+    result = refine(edges_of(message, rect), message.right, message.unit_ns, message.p, of, seeds, rect)
+    one = refine_batch(message, rect, 7.0)
+    np.testing.assert_array_equal(result.disparity[1::3], one.disparity)
+    assert (result.outcome[0::3] == module.NO_SEED).all()
+    assert (result.outcome[2::3] != module.REFINED).all()
 
 
 def test_an_edge_of_another_speed_is_refused() -> None:

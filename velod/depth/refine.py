@@ -64,43 +64,85 @@ OUTCOMES = (
 
 
 @dataclass(frozen=True, slots=True)
+class Edges:
+    """The planes of left events on the rectified image; NaN where there is none."""
+
+    x: F64  # (n,) rectified px
+    y: F64
+    t_s: F64  # (n,) of the plane at the event, before the batch's end (<= 0)
+    variance_s2: F64  # (n,) of t_s
+    slope_x: F64  # (n,) of the plane, s/px
+    slope_y: F64
+
+
+@dataclass(frozen=True, slots=True)
 class Refined:
-    """Outcome of each point; the rest is NaN unless it is REFINED (normal_x: unless there is no left plane)."""
+    """Outcome of each match; the rest is NaN unless it is REFINED."""
 
-    outcome: U8  # (n,)
-    disparity: F64  # (n,) px
-    normal_x: F64  # (n,) x of the rectified edge's unit normal, left
-    sigma_px: F64  # (n,) of the disparity, from the residuals of both planes
+    outcome: U8  # (m,)
+    disparity: F64  # (m,) px
+    sigma_px: F64  # (m,) of the disparity, from the residuals of both planes
+
+    def __getitem__(self, rows: I64) -> Refined:
+        return Refined(self.outcome[rows], self.disparity[rows], self.sigma_px[rows])
 
 
-def refine(
-    left: U16,
-    right: U16,
-    unit_ns: int,
-    x: U16,
-    y: U16,
-    p: U8,
-    seed_px: F32,
-    rectification: Rectification,
-    time_noise_s: float = 0.0,
-) -> Refined:
-    """Refine the disparities ``seed_px`` (n,) (NaN: none) of events at sensor pixels x, y with polarity p.
+def left_edges(
+    left: U16, unit_ns: int, x: U16, y: U16, p: U8, rectification: Rectification, time_noise_s: float = 0.0
+) -> Edges:
+    """The edges of events at sensor pixels x, y with polarity p, (n,) each.
 
-    ``left`` and ``right`` (2, h, w) are first-of-burst surfaces on the sensor grids, ages in steps of ``unit_ns``;
-    time stamps have an error of ``time_noise_s``.
+    ``left`` (2, h, w) is the first-of-burst surface on the sensor grid, ages in steps of ``unit_ns``; time stamps
+    have an error of ``time_noise_s``.
     """
-    n = x.shape[0]
-    out = Refined(np.empty(n, np.uint8), np.empty(n), np.empty(n), np.empty(n))
-    _refine(
+    at = rectification.left_xy[y, x].astype(np.float64)
+    n = len(x)
+    out = Edges(at[:, 0].copy(), at[:, 1].copy(), np.empty(n), np.empty(n), np.empty(n), np.empty(n))
+    _left_edges(
         readonly(left, np.uint16),
-        readonly(right, np.uint16),
         unit_ns / NS_PER_S,
         x.astype(np.int64),
         y.astype(np.int64),
         p.astype(np.int64),
-        seed_px,
-        rectification.left_xy,
         rectification.left_covector,
+        time_noise_s,
+        np.empty(WIDE_SIZE + SIZE),
+        out.t_s,
+        out.variance_s2,
+        out.slope_x,
+        out.slope_y,
+    )
+    return out
+
+
+def refine(
+    edges: Edges,
+    right: U16,
+    unit_ns: int,
+    p: U8,
+    of: I64,
+    seed_px: F64,
+    rectification: Rectification,
+    time_noise_s: float = 0.0,
+) -> Refined:
+    """Refine the disparities ``seed_px`` (m,) (NaN: none), each of that edge ``of`` (m,) those with polarity p (n,).
+
+    ``right`` (2, h, w), ``unit_ns`` and ``time_noise_s`` as of ``left_edges``.
+    """
+    m = len(of)
+    out = Refined(np.empty(m, np.uint8), np.empty(m), np.empty(m))
+    _refine(
+        readonly(right, np.uint16),
+        unit_ns / NS_PER_S,
+        p.astype(np.int64),
+        of,
+        seed_px,
+        edges.x,
+        edges.y,
+        edges.t_s,
+        edges.variance_s2,
+        edges.slope_x,
+        edges.slope_y,
         rectification.right_covector,
         rectification.remap_right[0],
         rectification.remap_right[1],
@@ -108,7 +150,6 @@ def refine(
         np.empty(WIDE_SIZE + SIZE),
         out.outcome,
         out.disparity,
-        out.normal_x,
         out.sigma_px,
     )
     return out
@@ -199,16 +240,48 @@ def _refine_one(
 
 
 @njit(cache=True, nogil=True)
-def _refine(
+def _left_edges(
     left: U16,
-    right: U16,
     unit_s: float,
     x: I64,
     y: I64,
     p: I64,
-    seed: F32,
-    left_xy: F32,
-    left_covector: F32,
+    covector: F32,
+    time_noise_s: float,
+    age: F64,
+    t: F64,
+    variance: F64,
+    slope_x: F64,
+    slope_y: F64,
+) -> None:
+    for k in range(len(x)):
+        t[k] = variance[k] = slope_x[k] = slope_y[k] = math.nan
+        n, gx, gy, t0, rms, _qxx, _qxy, _qyy = _plane(
+            left, p[k], x[k], y[k], unit_s, _MIN_NEIGHBOURS, time_noise_s, age
+        )
+        slope = math.sqrt(gx * gx + gy * gy)
+        if n == 0 or not slope > 0.0:
+            continue
+        M = covector[y[k], x[k]]
+        t[k] = t0
+        variance[k] = honest_rms(n, rms, slope, time_noise_s) ** 2 / n
+        slope_x[k] = M[0, 0] * gx + M[0, 1] * gy
+        slope_y[k] = M[1, 0] * gx + M[1, 1] * gy
+
+
+@njit(cache=True, nogil=True)
+def _refine(
+    right: U16,
+    unit_s: float,
+    p: I64,
+    of: I64,
+    seed: F64,
+    x: F64,
+    y: F64,
+    t: F64,
+    variance: F64,
+    slope_x: F64,
+    slope_y: F64,
     right_covector: F32,
     map_x: F32,
     map_y: F32,
@@ -216,47 +289,33 @@ def _refine(
     age: F64,
     outcome: U8,
     disparity: F64,
-    normal_x: F64,
     sigma_px: F64,
 ) -> None:
-    for k in range(x.shape[0]):
-        xk, yk, pk = int(x[k]), int(y[k]), int(p[k])
-        disparity[k] = math.nan
-        normal_x[k] = math.nan
-        sigma_px[k] = math.nan
-        outcome[k] = NO_LEFT_PLANE
-        n, gx, gy, t_left, rms, _qxx, _qxy, _qyy = _plane(
-            left, pk, xk, yk, unit_s, _MIN_NEIGHBOURS, time_noise_s, age
-        )
-        if n == 0:
-            continue
-        M = left_covector[yk, xk]
-        gx_left = M[0, 0] * gx + M[0, 1] * gy
-        gy_left = M[1, 0] * gx + M[1, 1] * gy
-        slope = math.sqrt(gx_left * gx_left + gy_left * gy_left)
+    for i in range(len(of)):
+        k = of[i]
+        disparity[i] = sigma_px[i] = math.nan
+        slope = math.hypot(slope_x[k], slope_y[k])
         if not slope > 0.0:
-            continue
-        normal_x[k] = gx_left / slope
-        if not math.isfinite(seed[k]):
-            outcome[k] = NO_SEED
-            continue
-        if abs(normal_x[k]) < MIN_NORMAL_X:
-            outcome[k] = FLAT_EDGE
-            continue
-        outcome[k], disparity[k], sigma_px[k] = _refine_one(
-            right,
-            unit_s,
-            pk,
-            float(left_xy[yk, xk, 0]),
-            float(left_xy[yk, xk, 1]),
-            float(seed[k]),
-            t_left,
-            honest_rms(n, rms, math.sqrt(gx * gx + gy * gy), time_noise_s) ** 2 / n,
-            gx_left,
-            gy_left,
-            right_covector,
-            map_x,
-            map_y,
-            time_noise_s,
-            age,
-        )
+            outcome[i] = NO_LEFT_PLANE
+        elif not math.isfinite(seed[i]):
+            outcome[i] = NO_SEED
+        elif abs(slope_x[k]) < MIN_NORMAL_X * slope:
+            outcome[i] = FLAT_EDGE
+        else:
+            outcome[i], disparity[i], sigma_px[i] = _refine_one(
+                right,
+                unit_s,
+                p[k],
+                x[k],
+                y[k],
+                seed[i],
+                t[k],
+                variance[k],
+                slope_x[k],
+                slope_y[k],
+                right_covector,
+                map_x,
+                map_y,
+                time_noise_s,
+                age,
+            )

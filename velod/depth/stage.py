@@ -3,27 +3,63 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from velod.config import Settings
-from velod.depth.refine import FLAT_EDGE, OUTCOMES, REFINED, Refined, refine
+from velod.depth.passage import NOWHERE, Passages, choose, passages, sensor_index
+from velod.depth.refine import FLAT_EDGE, OUTCOMES, REFINED, Edges, Refined, left_edges, refine
+from velod.depth.surroundings import SAME_TIME_PX, unmatched_share
 from velod.depth.time_surface import TimeSurface, decay_table
 from velod.depth.zncc import Matches, Surface, match
 from velod.events.sensor_size import for_sensor
 from velod.geometry.calibration import Calibration
 from velod.geometry.rectify import rectify
-from velod.types import F32, F64, I64, DepthBatch, StereoBatch
+from velod.types import F64, I64, DepthBatch, StereoBatch
 
 Bools = NDArray[np.bool_]
 
-# Where the second peak of the correlation reaches this share of the first, refinement decides whether it is a rival.
+# A confirmed match whose correlation reaches this share of the best one's is its rival.
 _RIVAL_SHARE = 0.75
-_RIVAL_PX = 2.0
+# So far from a passage, in px along the row and across it, may the time of a pixel be that still shows it: half a
+# pixel of rounding each way, on the rectified grid and on the sensor.
+_REACH_X_PX, _REACH_Y_PX = 1.0, 0.5
+_REACH_NOISES = 2.5
+# The way back ends at a whole pixel, and began at one.
+_WHOLE_PX = 1.0
 # Block matching along an edge that lies in the row: twice the spread of other edges, and an error that neighbours
 # share, so that it must not average out.
 _FLAT_EDGE_FACTOR = 4.0
+# Between these shares of unmatched surroundings a place goes from being as good as others to telling nothing: in
+# spins flows are off by 1.0 to 1.4 of their sigmas below and by 1.9 to 2.2 above, most of them too fast.
+_MANY_UNMATCHED, _ALL_UNMATCHED = 0.85, 0.95
+
+
+@dataclass(frozen=True, slots=True)
+class _Batch:
+    """A batch as it is matched: its events on the rectified images, and time surfaces of these."""
+
+    message: StereoBatch
+    left: Surface
+    right_mirrored: Surface
+    x: I64  # (n,) nearest rectified pixel, -1 where no block fits
+    y: I64
+    edges: Edges
+    noise_s: float  # of time stamps
+
+    @property
+    def reach_s(self) -> F64:
+        """(n,) by how much the time of a pixel where an edge passes may differ from that of the passage."""
+        reach = _REACH_X_PX * np.abs(self.edges.slope_x) + _REACH_Y_PX * np.abs(self.edges.slope_y)
+        return np.asarray(reach + _REACH_NOISES * self.noise_s)
+
+    @property
+    def same_time_s(self) -> F64:
+        """(n,) by how much times may differ of which the same edge passes neighbouring pixels in both cameras."""
+        slope = np.hypot(self.edges.slope_x, self.edges.slope_y)
+        return np.asarray(SAME_TIME_PX * slope + _REACH_NOISES * self.noise_s)
 
 
 class DepthStage:
@@ -35,6 +71,8 @@ class DepthStage:
         self._rectification = rect = rectify(calibration)
         self._left_shape = (calibration.left.height, calibration.left.width)
         self._right_shape = (calibration.right.height, calibration.right.width)
+        self._left_index = sensor_index(rect.remap_left, self._left_shape)
+        self._right_index = sensor_index(rect.remap_right, self._right_shape)
         self._left_surface = TimeSurface(None if rect.identity else rect.remap_left)
         self._right_surface = TimeSurface(None if rect.identity else rect.remap_right, mirrored=True)
         self._decay_unit_ns = 0
@@ -51,17 +89,17 @@ class DepthStage:
         if not self._fits(message):
             self.counters["batches.size"] += 1
             return []
-        xy = self._rectification.left_xy[message.y, message.x]
-        left, right_mirrored = self._surfaces(message)
-        x, y = _nearest_pixel(xy[:, 0]), _nearest_pixel(xy[:, 1])
-        x[self._overtaken(message)] = -1
-        matches = match(left, right_mirrored, x, y, self._settings.block_px, self._settings.max_disparity_px)
-        refined = self._refine(message, matches.disparity)
+        batch = self._view(message)
+        s = self._settings
+        matches = match(batch.left, batch.right_mirrored, batch.x, batch.y, s.block_px, s.max_disparity_px)
+        refined, rivalled = self._refine(batch, matches)
         is_refined = refined.outcome == REFINED
         disparity = np.where(is_refined, refined.disparity, matches.disparity)
-        accepted = self._accept(left, right_mirrored, x, y, matches, disparity, refined.outcome)
-        accepted &= ~self._has_rival(message, matches, disparity, accepted & is_refined)
-        return [self._publish(message, disparity, self._sigma_px(refined), is_refined, accepted)]
+        candidates = self._candidates(matches, refined.outcome, rivalled)
+        accepted = candidates & self._unambiguous(batch, matches, disparity, candidates, is_refined)
+        self.counters["points.ambiguous"] += int(np.count_nonzero(candidates & ~accepted))
+        sigma_px = self._sigma_px(batch, refined, accepted)
+        return [self._publish(message, disparity, sigma_px, is_refined, accepted)]
 
     def _fits(self, message: StereoBatch) -> bool:
         """The surfaces and the events are on the sensors of the calibration."""
@@ -87,112 +125,120 @@ class DepthStage:
         self.counters["points.overtaken"] += int(np.count_nonzero(overtaken))
         return overtaken
 
-    def _surfaces(self, message: StereoBatch) -> tuple[Surface, Surface]:
-        """Time surfaces on the rectified grid: the left one, and the right one mirrored."""
+    def _view(self, message: StereoBatch) -> _Batch:
+        """Events and time surfaces on the rectified grid, the right one mirrored."""
         if message.unit_ns != self._decay_unit_ns:
             self._decay_unit_ns = message.unit_ns
             self._decay = decay_table(message.unit_ns, 1e-3 * self._settings.tau_ms)
-        return (
-            Surface.of(self._left_surface.render(message.left_last, self._decay)),
-            Surface.of(self._right_surface.render(message.right_last, self._decay)),
+        noise_s = 1e-9 * message.time_noise_ns
+        edges = left_edges(
+            message.left, message.unit_ns, message.x, message.y, message.p, self._rectification, noise_s
+        )
+        x, y = _nearest_pixel(edges.x), _nearest_pixel(edges.y)
+        x[self._overtaken(message)] = -1
+        return _Batch(
+            message=message,
+            left=Surface.of(self._left_surface.render(message.left_last, self._decay)),
+            right_mirrored=Surface.of(self._right_surface.render(message.right_last, self._decay)),
+            x=x,
+            y=y,
+            edges=edges,
+            noise_s=noise_s,
         )
 
-    def _refine(self, message: StereoBatch, disparity_px: F32) -> Refined:
-        """Plane coincidence, seeded by the best match whatever its score."""
-        seed = disparity_px if self._settings.refine else np.full_like(disparity_px, np.nan)
-        refined = refine(
-            message.left,
-            message.right,
-            message.unit_ns,
-            message.x,
-            message.y,
-            message.p,
-            seed,
-            self._rectification,
-            1e-9 * message.time_noise_ns,
+    def _refine(self, batch: _Batch, matches: Matches) -> tuple[Refined, Bools]:
+        """Plane coincidence wherever the right edge passes with the left one: the match that looks most alike of
+        those that it confirms, of each point; and whether another one could be it as well."""
+        message, edges, n = batch.message, batch.edges, len(batch.x)
+        places, seed = Passages(np.arange(n), np.full(n, NOWHERE)), np.full(n, np.nan)
+        if self._settings.refine:
+            places = passages(
+                message.right, message.unit_ns, self._right_index, batch.x, batch.y, message.p,
+                edges.t_s, batch.reach_s, -1,
+                matches.scores, self._settings.min_zncc, self._settings.max_disparity_px,
+            )  # fmt: skip
+            at_place = places.disparity + (edges.x - batch.x)[places.of]
+            seed = np.where(places.disparity == NOWHERE, matches.disparity[places.of], at_place)
+        found = refine(
+            edges, message.right, message.unit_ns, message.p, places.of, seed, self._rectification, batch.noise_s
         )
+        best, rival = choose(places, found.disparity, matches.scores, _RIVAL_SHARE)
+        refined = found[best]
         count = np.bincount(refined.outcome, minlength=len(OUTCOMES))
         for number, name in enumerate(OUTCOMES):
             if number != REFINED and count[number]:
                 self.counters[f"unrefined.{name}"] += int(count[number])
-        return refined
+        return refined, rival >= 0
 
-    def _accept(
-        self,
-        left: Surface,
-        right_mirrored: Surface,
-        x: I64,
-        y: I64,
-        matches: Matches,
-        disparity: F64,
-        outcome: NDArray[np.uint8],
-    ) -> Bools:
-        """(n,) which disparities stand: refined or of a strong match, and checked against ambiguity."""
+    def _candidates(self, matches: Matches, outcome: NDArray[np.uint8], rivalled: Bools) -> Bools:
+        """(n,) which matches are worth checking: refined without a rival, or strong where that cannot be had."""
         s = self._settings
-        matched = np.isfinite(disparity)
+        matched = np.isfinite(matches.disparity)
         is_refined = np.asarray(outcome == REFINED)
         # On real events every sixth match that refinement could have confirmed and did not is off by half its depth.
         trusted = is_refined | (outcome == FLAT_EDGE) if s.refine and s.block_only == "flat" else matched
-        strong = is_refined | (matched & trusted & matches.enclosed & (matches.score >= s.min_zncc))
-        accepted = strong
-        if s.check == "left-right":
-            # Refined ones as well: on real events one in thirty sits on the wrong edge of a repetitive texture, and
-            # of those that agree one in a hundred.
-            accepted = self._left_right_agree(left, right_mirrored, x, y, disparity, strong)
-        elif s.check == "uniqueness":
-            accepted = is_refined | (strong & (matches.second <= s.uniqueness * matches.score))
+        alike = matches.score >= s.min_zncc
+        strong = alike & (is_refined | (matched & trusted & matches.enclosed))
         self.counters["points.no_match"] += int(np.count_nonzero(~matched))
         self.counters["points.unconfirmed"] += int(np.count_nonzero(matched & ~trusted))
         self.counters["points.low_zncc"] += int(np.count_nonzero(matched & trusted & ~strong))
-        self.counters["points.ambiguous"] += int(np.count_nonzero(strong & ~accepted))
-        return accepted
+        # A repetitive texture matches itself at every period: left and right agree on the wrong one.
+        self.counters["points.ambiguous"] += int(np.count_nonzero(rivalled))
+        return strong & ~rivalled
 
-    def _has_rival(self, message: StereoBatch, matches: Matches, disparity: F64, among: Bools) -> Bools:
-        """(n,) refined points whose second match is nearly as good, and confirmed by plane coincidence as well.
-
-        A repetitive texture matches itself a period away in both directions: left and right agree on the wrong one.
-        """
-        at = np.flatnonzero(among & (matches.second >= _RIVAL_SHARE * matches.score))
-        second = refine(
-            message.left,
-            message.right,
-            message.unit_ns,
-            message.x[at],
-            message.y[at],
-            message.p[at],
-            matches.rival[at],
-            self._rectification,
-            1e-9 * message.time_noise_ns,
-        )
-        out = np.zeros_like(among)
-        out[at] = (second.outcome == REFINED) & (np.abs(second.disparity - disparity[at]) > _RIVAL_PX)
-        self.counters["points.ambiguous"] += int(np.count_nonzero(out))
-        return out
-
-    def _left_right_agree(
-        self, left: Surface, right_mirrored: Surface, x: I64, y: I64, disparity: F64, candidates: Bools
+    def _unambiguous(
+        self, batch: _Batch, matches: Matches, disparity: F64, candidates: Bools, is_refined: Bools
     ) -> Bools:
-        """Those candidates whose match in the right image has its own best match back here."""
-        at = np.flatnonzero(candidates)
-        x_right = x[at] - np.rint(disparity[at]).astype(np.int64)
+        """(n,) which of the candidates pass the check that is set."""
+        s = self._settings
+        if s.check == "left-right":
+            # Refined ones as well: on real events one in thirty sits on the wrong edge of a repetitive texture, and
+            # of those that agree one in a hundred.
+            back = self._match_back(batch, disparity, candidates, is_refined)
+            allowed = s.left_right_px + np.where(is_refined, _WHOLE_PX, 0.0)
+            return np.asarray(np.abs(back - disparity) <= allowed)
+        if s.check == "uniqueness":
+            return np.asarray(is_refined | (matches.second <= s.uniqueness * matches.score))
+        return np.ones_like(candidates)
+
+    def _match_back(self, batch: _Batch, disparity: F64, candidates: Bools, is_refined: Bools) -> F64:
+        """(n,) disparities of the candidates' matches in the left image, NaN of the others.
+
+        Found as the candidates were: refined ones among the places where a left edge passes with the right one.
+        """
+        s, at, message = self._settings, np.flatnonzero(candidates), batch.message
+        x_right, y = batch.x[at] - np.rint(disparity[at]).astype(np.int64), batch.y[at]
         # Mirrored, the right image takes the left one's part.
-        back = match(
-            right_mirrored,
-            left,
-            self._rectification.width - 1 - x_right,
-            y[at],
-            self._settings.block_px,
-            self._settings.max_disparity_px,
-        )
-        out = np.zeros_like(candidates)
-        out[at] = np.abs(back.disparity - disparity[at]) <= self._settings.left_right_px
+        mirrored_x = self._rectification.width - 1 - x_right
+        back = match(batch.right_mirrored, batch.left, mirrored_x, y, s.block_px, s.max_disparity_px)
+        places = passages(
+            message.left, message.unit_ns, self._left_index, x_right, y, message.p[at],
+            batch.edges.t_s[at], batch.reach_s[at], 1, back.scores, s.min_zncc, s.max_disparity_px,
+        )  # fmt: skip
+        at_place = np.where(places.disparity == NOWHERE, np.nan, places.disparity)
+        best, _ = choose(places, at_place, back.scores, _RIVAL_SHARE)
+        out = np.full(len(disparity), np.nan)
+        out[at] = np.where(is_refined[at], at_place[best], back.disparity)
         return out
 
-    def _sigma_px(self, refined: Refined) -> F64:
-        """(n,) disparity sigma: for refined points from the planes' residuals and the edge's slope along the row."""
+    def _sigma_px(self, batch: _Batch, refined: Refined, accepted: Bools) -> F64:
+        """(n,) disparity sigma: for refined points from the planes' residuals and the edge's slope along the row.
+
+        Beside a jump of depth it grows up to the disparity itself: which surface an edge there is of is not known,
+        and its flow is no better.
+        """
         s = self._settings
         block = np.where(refined.outcome == FLAT_EDGE, _FLAT_EDGE_FACTOR, 1.0) * s.sigma_zncc_px
-        return np.asarray(np.where(refined.outcome == REFINED, np.hypot(refined.sigma_px, s.sigma_refined_px), block))
+        sigma = np.where(refined.outcome == REFINED, np.hypot(refined.sigma_px, s.sigma_refined_px), block)
+        at = np.flatnonzero(accepted & (refined.outcome == REFINED))
+        message, disparity = batch.message, refined.disparity[at]
+        share = unmatched_share(
+            message.left, message.right, message.unit_ns, self._left_index, self._right_index,
+            batch.x[at], batch.y[at], message.p[at], disparity, batch.same_time_s[at],
+        )  # fmt: skip
+        doubt = np.clip((share - _MANY_UNMATCHED) / (_ALL_UNMATCHED - _MANY_UNMATCHED), 0.0, 1.0)
+        sigma[at] = np.hypot(sigma[at], doubt * disparity)
+        return np.asarray(sigma)
 
     def _publish(
         self, message: StereoBatch, disparity: F64, sigma_px: F64, is_refined: Bools, accepted: Bools
@@ -218,6 +264,6 @@ class DepthStage:
         )
 
 
-def _nearest_pixel(x: F32) -> I64:
+def _nearest_pixel(x: F64) -> I64:
     """Rounded positions; -1, where no block fits, for NaN."""
-    return np.asarray(np.nan_to_num(np.floor(x + np.float32(0.5)), nan=-1.0), dtype=np.int64)
+    return np.asarray(np.nan_to_num(np.floor(x + 0.5), nan=-1.0), dtype=np.int64)

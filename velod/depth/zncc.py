@@ -52,7 +52,7 @@ class Matches:
     disparity: F32  # (n,) px, sub-pixel
     score: F32  # (n,) ZNCC of the best whole disparity, -1..1
     second: F32  # (n,) ZNCC of the best one more than 2 px away, -1: none
-    rival: F32  # (n,) its whole disparity, px, NaN: none
+    scores: F32  # (n, >= max_disparity_px + 1) ZNCC of each whole disparity, NONE where its block leaves the image
     enclosed: NDArray[np.bool_]  # (n,) the best has a neighbour on both sides: a real peak
 
 
@@ -65,8 +65,9 @@ def match(
     and mirror: the mirrored right surface is the reference, its x is w - 1 - x, and the left one is as it is.
     """
     n = x.shape[0]
-    disparity, score, second, rival = (np.empty(n, np.float32) for _ in range(4))
-    out = Matches(disparity, score, second, rival, np.empty(n, dtype=np.bool_))
+    disparity, score, second = (np.empty(n, np.float32) for _ in range(3))
+    room = -(-(max_disparity_px + 1) // CHUNK) * CHUNK
+    out = Matches(disparity, score, second, np.empty((n, room), np.float32), np.empty(n, dtype=np.bool_))
     half = block_px // 2
     _match(
         reference.values,
@@ -79,12 +80,12 @@ def match(
         y,
         half,
         max_disparity_px,
-        np.empty(-(-(max_disparity_px + 1) // CHUNK) * CHUNK, np.float32),
+        np.empty(room, np.float32),
         np.empty(block_px, np.float32),
         out.disparity,
         out.score,
         out.second,
-        out.rival,
+        out.scores,
         out.enclosed,
     )
     return out
@@ -186,15 +187,6 @@ def _first_at(scores: F32, least: np.float32) -> int:
     return int(place)
 
 
-@njit(cache=True, nogil=True)
-def _last_at(scores: F32, least: np.float32) -> int:
-    """The last place of a score of ``least`` or more, -1: none."""
-    place = np.int32(-1)
-    for i in range(len(scores)):
-        place = max(place, np.int32(i) if scores[i] >= least else np.int32(-1))
-    return int(place)
-
-
 @njit(cache=True, nogil=True, error_model="numpy")
 def _match(
     reference: F32,
@@ -212,7 +204,7 @@ def _match(
     disparity: F32,
     score: F32,
     second: F32,
-    rival: F32,
+    kept: F32,
     enclosed: NDArray[np.bool_],
 ) -> None:
     h, w = reference.shape
@@ -222,7 +214,7 @@ def _match(
         disparity[k] = np.nan
         score[k] = np.nan
         second[k] = -1.0
-        rival[k] = np.nan
+        kept[k] = NONE
         enclosed[k] = False
         # The block must lie inside at x and at x - d.
         if xk < half or xk >= w - half or yk < half or yk >= h - half:
@@ -240,6 +232,7 @@ def _match(
             _correlate(reference, mirrored, xk, yk, xm, half, sum_l / area, n, row, scores)
         _normalise(scores[:n], mirrored_total, mirrored_squares, xm, yk, half, var_l)
         scores[n:] = NONE
+        kept[k] = scores
         score[k] = _largest(scores)
         best = _first_at(scores, score[k])
         offset = np.float32(0.0)
@@ -252,6 +245,3 @@ def _match(
         disparity[k] = best + offset
         scores[max(best - RIVAL_PX, 0) : best + RIVAL_PX + 1] = NONE
         second[k] = _largest(scores)
-        other = _last_at(scores, second[k])
-        if other >= 0:
-            rival[k] = other

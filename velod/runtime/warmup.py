@@ -28,7 +28,8 @@ from velod.types import (
     StereoBatch,
 )
 
-_SPACING_PX = 24.0
+# At uneven distances, as what repeats itself matches anywhere. They reach beyond every sensor.
+_EDGES_PX = 24.0 * (np.arange(-200, 400) + 0.4 * np.mod(0.618 * np.arange(600), 1.0))
 _SLANT = 0.3  # columns per row
 _SPEED_PX_S = 250.0
 _DISPARITY_PX = 8
@@ -61,21 +62,20 @@ def warm_up(stage: str, settings: Settings, calibration: Calibration) -> int:
     return sum(len(built.handle(message)) for message in messages[stage](calibration))
 
 
-def _crossing_px(width: int, height: int, shift_px: int) -> F64:
-    """(h, w) how far behind the nearest edge on its right-hand side each pixel lies, px."""
+def _crossing_px(width: int, height: int, shift_px: int) -> tuple[F64, F64]:
+    """(h, w) px by which each pixel lies behind the nearest edge on its right, and ahead of that on its left."""
     y, x = np.mgrid[:height, :width].astype(np.float64)
-    behind_px: F64 = np.mod(_SLANT * y - (x + shift_px), _SPACING_PX)
-    return behind_px
+    place = x + shift_px - _SLANT * y
+    right = np.searchsorted(_EDGES_PX, place)
+    return _EDGES_PX[right] - place, place - _EDGES_PX[right - 1]
 
 
 def _packets(calibration: Calibration) -> Iterator[Message]:
     t_ns = np.arange(1, 31, dtype=np.int64) * _IMU_NS
     yield ImuPacket(0, int(t_ns[-1]), t_ns, np.tile(_SPECIFIC_FORCE, (len(t_ns), 1)), np.zeros((len(t_ns), 3)))
     for name, camera, shift_px in (("left", calibration.left, 0), ("right", calibration.right, _DISPARITY_PX)):
-        # The edge that is now behind the pixel by the rest of the spacing reaches it later.
-        reached_ns = (
-            (_SPACING_PX - _crossing_px(camera.width, camera.height, shift_px)) / _SPEED_PX_S * NS_PER_S
-        ).ravel()
+        _, ahead_px = _crossing_px(camera.width, camera.height, shift_px)
+        reached_ns = (ahead_px / _SPEED_PX_S * NS_PER_S).ravel()
         order = np.argsort(reached_ns, kind="stable")
         y, x = np.divmod(order, camera.width)
         yield EventPacket(
@@ -110,7 +110,7 @@ def _stereo_batches(calibration: Calibration) -> Iterator[Message]:
     unit_ns = 1600
     surfaces = []
     for camera, shift_px in ((calibration.left, 0), (calibration.right, _DISPARITY_PX)):
-        behind_px = _crossing_px(camera.width, camera.height, shift_px)
+        behind_px, _ = _crossing_px(camera.width, camera.height, shift_px)
         surfaces.append((behind_px / _SPEED_PX_S * NS_PER_S / unit_ns).astype(np.uint16) + np.uint16(1))
     left, right = surfaces
     age = left[y, x].astype(np.uint32) * np.uint32(unit_ns)
