@@ -7,6 +7,7 @@ those of this process as soon as Zenoh reports the link, is told not to. Linux o
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 import socket
@@ -14,10 +15,14 @@ import struct
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from functools import cache
+from queue import SimpleQueue
 from threading import Thread
-from typing import Any, Final
+from typing import Final
 
 import zenoh
+
+log = logging.getLogger("velod")
 
 RETRANSMIT_MIN_US: Final = 20_000
 """After the round trip, how long at least until a segment is sent again. The kernel's 200 ms would keep a velocity,
@@ -26,8 +31,6 @@ and all those behind it, for longer than it is of use; its other means need late
 _TCP_RTO_MIN_US: Final = 45  # linux/tcp.h since 6.15; Python has no name for it
 _NO_LINGER: Final = struct.pack("ii", 0, 0)
 _FILES: Final = "/proc/self/fd"
-_EVENTS: Final = 4096
-"""That may wait to be looked at: far more than a process has links."""
 _LOCATOR = re.compile(r"(?:tcp|tls)/\[?(?P<host>[^\]]+?)\]?:(?P<port>\d+)(?:[?#].*)?")
 
 
@@ -47,16 +50,32 @@ def follow(session: zenoh.Session, changed: Callable[[zenoh.LinkEvent], None], *
     """Call ``changed`` for every link that comes or goes as long as ``session`` is open; with ``history`` also for
     those that are there.
 
-    In a thread of its own: Zenoh reports links from a thread that receives for others, and would keep them waiting
-    for as long as Python takes, which is 0.1 s where the interpreter is busy.
+    In a thread of its own, one for all sessions: Zenoh reports links from a thread that receives for others, which
+    would wait for as long as Python takes, 0.1 s where the interpreter is busy.
     """
-    listener = session.info.declare_link_events_listener(zenoh.handlers.FifoChannel(_EVENTS), history=history)
-    Thread(target=_call_for_each, args=(listener, changed), name="links", daemon=True).start()
+    _start_thread()
+
+    def note(event: zenoh.LinkEvent) -> None:
+        _to_do.put((changed, event))
+
+    session.info.declare_link_events_listener(zenoh.handlers.Callback(note, indirect=False), history=history)
 
 
-def _call_for_each(listener: Any, changed: Callable[[zenoh.LinkEvent], None]) -> None:
-    for event in listener:  # until the session is closed
-        changed(event)
+_to_do: SimpleQueue[tuple[Callable[[zenoh.LinkEvent], None], zenoh.LinkEvent]] = SimpleQueue()
+
+
+@cache
+def _start_thread() -> None:
+    Thread(target=_do_it, name="links", daemon=True).start()
+
+
+def _do_it() -> None:
+    while True:
+        changed, event = _to_do.get()
+        try:
+            changed(event)
+        except Exception:  # of one link; those to come are looked after all the same
+            log.exception("a link that has changed")
 
 
 def set_options(src: str, dst: str) -> int:
