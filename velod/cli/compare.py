@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from velod import __version__
 from velod.cli.cases import Outcome, SequenceJob, judge_recording
 from velod.cli.config import calibration_of, settings_of
-from velod.cli.exit import RunFailed
+from velod.cli.exit import RunFailed, raise_if_interrupted
 from velod.cli.jobs import commit, run_jobs
 from velod.cli.report import Line, progress_bar, write_json
 from velod.cli.stages import true_depth_of
@@ -161,6 +161,7 @@ class _OneLine:
         self._what, self._since_s = "", time.monotonic()
 
     def show(self, what: str, share: float) -> None:
+        raise_if_interrupted()
         if what != self._what:
             self._what, self._since_s = what, time.monotonic()
         if self._line.due():

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Callable, Sequence
+from io import TextIOWrapper
 
 from velod import __version__
 from velod.cli import play_commands, proof_commands, service_commands, watch_commands
-from velod.cli.exit import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE, RunFailed
+from velod.cli.exit import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE, RunFailed, interrupt_on_signals
 from velod.cli.options import plain
 from velod.cli.values import require_writable
 from velod.runtime.kernel_cache import ensure_cache_directory
@@ -16,10 +18,12 @@ from velod.runtime.kernel_cache import ensure_cache_directory
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; the exit code. What a user can put right is one line on stderr, never a traceback."""
-    args = parser().parse_args(argv)
-    command: Callable[[argparse.Namespace], int] = args.command
-    ensure_cache_directory()
+    _provide_streams()
     try:
+        interrupt_on_signals()
+        args = parser().parse_args(argv)
+        command: Callable[[argparse.Namespace], int] = args.command
+        ensure_cache_directory()
         require_writable(*(getattr(args, option, None) for option in ("json", "csv", "markdown")))
         return command(args)
     except KeyboardInterrupt:
@@ -38,9 +42,19 @@ def main(argv: Sequence[str] | None = None) -> int:
         return EXIT_USAGE
 
 
+def _provide_streams() -> None:
+    """Somewhere to write to where stdout or stderr was closed; a ``?`` for what their encoding does not have."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115 (as long as the process)
+        elif isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="replace")
+
+
 def _one_line(e: Exception) -> str:
-    if isinstance(e, OSError) and e.strerror and e.filename is not None:
-        return f"{e.filename}: {e.strerror}"
+    if isinstance(e, OSError) and e.strerror:
+        return e.strerror if e.filename is None else f"{e.filename}: {e.strerror}"
     return " ".join(str(e).split()) or type(e).__name__
 
 

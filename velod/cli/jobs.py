@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 import velod
 from velod.cli.cases import Outcome, SequenceJob
-from velod.cli.exit import RunFailed
+from velod.cli.exit import RunFailed, raise_if_interrupted
 from velod.cli.report import Line
 
 if TYPE_CHECKING:
@@ -36,10 +36,10 @@ def run_jobs(jobs: Sequence[SequenceJob], processes: int) -> list[Outcome]:
     notes, stop = context.Queue(), context.Event()
     line, outcomes, failed, code = _Progress(len(jobs)), {}, [], code_fingerprint()
     pool = ProcessPoolExecutor(processes, context, _begin, (notes, stop))
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends as Ctrl-C does
     try:
         waiting: dict[Future[Outcome], SequenceJob] = {pool.submit(_kept_or_run, job, code): job for job in jobs}
         while waiting:
+            raise_if_interrupted()
             done, _ = wait(waiting, timeout=_LOOK_S, return_when=FIRST_COMPLETED)
             while not notes.empty():
                 line.note(*notes.get())
@@ -55,7 +55,6 @@ def run_jobs(jobs: Sequence[SequenceJob], processes: int) -> list[Outcome]:
         # The jobs look at it now and then: nobody has to wait for a job of minutes.
         stop.set()
         pool.shutdown(cancel_futures=True)
-        signal.signal(signal.SIGTERM, before)
         line.finish()
     if failed:
         raise RunFailed("; ".join(failed) + " (the others are kept: run it again)")

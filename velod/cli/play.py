@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import signal
 import sys
 import time
 from dataclasses import dataclass, field, replace
@@ -11,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 from velod.cli.config import calibration_of, settings_of
-from velod.cli.exit import RunFailed
+from velod.cli.exit import RunFailed, raise_if_interrupted
 from velod.cli.report import (
     Line,
     VelocityLine,
@@ -319,7 +318,6 @@ def simulate_to_file(recipe: Sequence, path: str, seconds: float, seed: int) -> 
     """Record a simulated sequence. Raises RecordingError."""
     from velod.sim import simulate
 
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C: half a file is not left behind
     with _Bar(f"simulating {seconds:g} s of {recipe.name}") as bar:
         simulate(recipe, seconds, seed, path, bar.show)
     print(f"wrote {path}")
@@ -381,6 +379,7 @@ class _Bar:
         self._line.finish()
 
     def show(self, share: float) -> None:
+        raise_if_interrupted()
         if not self._line.enabled and not self._said:
             print(self._what, file=sys.stderr)
             self._said = True

@@ -18,6 +18,7 @@ from typing import Any, TextIO
 
 import numpy as np
 
+from velod.cli.exit import raise_if_interrupted
 from velod.types import EventPacket, ImuPacket, Velocity
 
 CSV_COLUMNS = (
@@ -186,6 +187,7 @@ def with_progress(
     line = Line()
     start_s = time.monotonic()
     for packet in packets:
+        raise_if_interrupted()
         yield packet
         if line.due():
             done_ns = min(packet.t_ns, t_end_ns) - t_start_ns

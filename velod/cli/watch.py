@@ -137,10 +137,10 @@ def top(config: str | None, way: Way, *, once: bool) -> int:
             _collect(listener, newest, _DISCOVERY_S, until_complete=True)
             print(table(place, newest, listener.alive()))
             return 0 if newest else EXIT_FAILED
+        begin = _CLEAR_SCREEN if sys.stdout.isatty() else ""
         while True:
             _collect(listener, newest, _REFRESH_S, until_complete=False)
-            sys.stdout.write(f"{_CLEAR_SCREEN}{table(place, newest, listener.alive())}\n")
-            sys.stdout.flush()
+            print(begin + table(place, newest, listener.alive()), flush=True)
 
 
 def _collect(listener: Listener, newest: dict[str, Received], seconds: float, *, until_complete: bool) -> None:
