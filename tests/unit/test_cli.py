@@ -5,9 +5,12 @@ from __future__ import annotations
 import csv
 import json
 import re
+import signal
 import subprocess
 import sys
 import tomllib
+from collections.abc import Callable
+from io import BytesIO, TextIOWrapper
 from pathlib import Path
 
 import h5py
@@ -21,6 +24,7 @@ from velod.config import Settings
 from velod.eval.metrics import truth_at
 from velod.geometry.calibration import load_calibration, save_calibration
 from velod.io import open_recording
+from velod.sim import Sequence
 
 COMMANDS = ("demo", "run", "replay", "eval", "sim", "echo", "top", "config", "bench", "warmup", "doctor", "record")
 EVAL_KEYS = [
@@ -267,6 +271,47 @@ def test_a_run_without_a_valid_velocity_fails_and_says_so(
     said = capsys.readouterr().err
     assert said.startswith(f"velod: failed: {recording}: no valid velocity ({why}") and said.count("\n") == 1
     assert json.loads(out.read_text())["ave_mps"] is None
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_an_interrupt_that_python_drops_ends_long_work_all_the_same(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    class Array:
+        def __del__(self) -> None:
+            signal.raise_signal(signal.SIGINT)  # what is raised now is dropped
+
+    shares = []
+
+    def simulate(recipe: Sequence, seconds: float, seed: int, path: str, progress: Callable[[float], None]) -> None:
+        arrays = [Array()]
+        for share in (0.1, 0.2, 0.3):
+            shares.append(share)
+            progress(share)
+            arrays.clear()
+
+    monkeypatch.setattr("velod.sim.simulate", simulate)
+    assert main(["sim", "corridor-1", "-o", str(tmp_path / "a.h5")]) == 130
+    assert capsys.readouterr().err.splitlines()[-1] == "velod: interrupted"
+    assert shares == [0.1, 0.2]
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no device that is always full")
+@pytest.mark.parametrize(
+    ("where", "code", "said"), [(">&-", 0, ""), (">/dev/full", 2, "velod: error: No space left on device\n")]
+)
+def test_nowhere_to_write_to_is_no_traceback(where: str, code: int, said: str) -> None:
+    velod = f"{sys.executable} -P -m velod.cli config show {where}"
+    done = subprocess.run(["sh", "-c", velod], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (code, said)
+
+
+def test_what_a_terminal_cannot_show_is_a_question_mark(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (settings := tmp_path / "velod.toml").write_text('[rig]\ncalibration = "r\u00fcckw\u00e4rts.yaml"\n', "utf-8")
+    shown = BytesIO()
+    monkeypatch.setattr(sys, "stdout", TextIOWrapper(shown, "ascii", write_through=True))
+    assert main(["config", "show", "-c", str(settings)]) == 0
+    assert b'calibration = "r?ckw?rts.yaml"' in shown.getvalue()
 
 
 # --- what comes out ---
