@@ -59,8 +59,8 @@ def enter_and_select(
     _, h, w = first.shape
     low = max(border_px, REACH)
     age = np.empty(SIZE, np.float64)
-    begins = np.empty(t_ns.size, np.int32)
-    for i in begins[: enter_last(x, y, t_ns, p, last, refractory_ns, begins)]:
+    places, begins = np.empty(t_ns.size, np.int32), np.empty(t_ns.size, np.int32)
+    for i in begins[: enter_last(x, y, t_ns, p, last, refractory_ns, places, begins)]:
         k, r, c, t = int(p[i]), int(y[i]), int(x[i]), int(t_ns[i])
         first[k, r, c] = t
         for dr in range(-REACH, REACH + 1, REACH):

@@ -49,26 +49,34 @@ def update_sae(x: U16, y: U16, t_ns: I64, p: U8, first: I64, last: I64, refracto
             last[k, r, c] = t
         return
     # One surface at a time: stores into two by turns take twice as long.
-    begins = np.empty(min(t_ns.size, BLOCK), np.int32)
+    n = min(t_ns.size, BLOCK)
+    at, begins = np.empty(n, np.int32), np.empty(n, np.int32)
+    flat = first.reshape(-1)
     for start in range(0, t_ns.size, BLOCK):
         block = slice(start, start + BLOCK)
-        xs, ys, ts, ps = x[block], y[block], t_ns[block], p[block]
-        for i in begins[: enter_last(xs, ys, ts, ps, last, refractory_ns, begins)]:
-            first[ps[i], ys[i], xs[i]] = ts[i]
+        ts = t_ns[block]
+        for i in begins[: enter_last(x[block], y[block], ts, p[block], last, refractory_ns, at, begins)]:
+            flat[np.uint32(at[i])] = ts[i]
 
 
 @njit(cache=True, nogil=True)
-def enter_last(x: U16, y: U16, t_ns: I64, p: U8, last: I64, refractory_ns: int, begins: I32) -> int:
+def enter_last(x: U16, y: U16, t_ns: I64, p: U8, last: I64, refractory_ns: int, at: I32, begins: I32) -> int:
     """Enter events, in time order, into ``last`` (2, h, w); writes which of them begin a burst to ``begins`` (n,).
 
-    Returns how many do.
+    Their flat places in ``last`` are written to ``at`` (n,), in a loop of its own, which vectorises. Returns how many
+    begin one.
     """
+    _, h, w = last.shape
+    for i in range(t_ns.size):
+        at[i] = (np.int32(p[i]) * np.int32(h) + np.int32(y[i])) * np.int32(w) + np.int32(x[i])
+    flat = last.reshape(-1)
     n = 0
     for i in range(t_ns.size):
-        k, r, c, t = p[i], y[i], x[i], t_ns[i]
+        # Unsigned, so that nobody looks whether it counts from the end.
+        place, t = np.uint32(at[i]), t_ns[i]
         begins[n] = i
-        n += t - last[k, r, c] >= refractory_ns
-        last[k, r, c] = t
+        n += t - flat[place] >= refractory_ns
+        flat[place] = t
     return n
 
 

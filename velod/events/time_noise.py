@@ -54,13 +54,17 @@ def noise_variance(slope2: F64, variance: F64) -> float:
     is usual, so that planes of one slope alone do not pass for noise.
     """
     order = np.argsort(slope2)
-    groups = [(_middle(slope2[k]), _middle(np.sort(variance[k]))) for k in np.array_split(order, GROUPS)]
-    s, q = np.array(groups).T
-    q *= MEDIAN_OF_VARIANCE
-    # min over (a, k) of |(a + k s) / q - 1|^2
-    rows = np.stack([1.0 / q, s / q], axis=1)
-    (aa, ak), (_, kk) = rows.T @ rows
-    a1, k1 = rows.sum(axis=0)
+    slope2, variance = slope2[order], variance[order]
+    size, larger = divmod(len(order), GROUPS)
+    stop = 0
+    # min over (a, k) of |(a + k s) / q - 1|^2; a few numbers, which Python adds up sooner than numpy is asked to
+    aa = ak = kk = a1 = k1 = 0.0
+    for group in range(GROUPS):
+        start, stop = stop, stop + size + (group < larger)
+        s = _middle(slope2[start:stop])
+        q = MEDIAN_OF_VARIANCE * _middle(np.sort(variance[start:stop]))
+        aa, ak, kk = aa + 1.0 / q**2, ak + s / q**2, kk + (s / q) ** 2
+        a1, k1 = a1 + 1.0 / q, k1 + s / q
     usual = USUAL_RMS_PX**2
     a = (a1 * kk - k1 * ak) / max(aa * kk - ak * ak, 1e-12 * aa * kk)
     k = (k1 - a * ak) / kk
