@@ -68,7 +68,7 @@ def test_an_unknown_group_is_refused() -> None:
 def test_times_are_per_unit_and_the_ratio_is_the_peers_over_ours() -> None:
     result = measure(Case("x", lambda: 8_000, per=4, clocked=True, events=16), TINY)
     assert (result.median_us, result.mev_s) == (2.0, 2.0)
-    assert Result("x", 2.0, "y", 6.0, 1).row()["ratio"] == 3.0
+    assert Result("x", 2.0, 1, peer="y", peer_median_us=6.0).row()["ratio"] == 3.0
 
 
 def test_the_stream_is_the_seeds_and_both_cameras_see_the_same_edges() -> None:

@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from velod.alarms import Alarms
 from velod.config import from_tree
 from velod.ingest.imu import ImuStream
 from velod.ingest.imu_units import ImuUnits
@@ -53,7 +54,7 @@ def twin(packets: list[ImuPacket]) -> tuple[list[int], Counter[str]]:
 def test_good_samples_are_those_of_the_rule_however_they_are_packed(seed: int) -> None:
     counters: Counter[str] = Counter()
     settings = from_tree({"ingest": {"imu_frozen_samples": MAX_FROZEN}}).ingest
-    stream = ImuStream(settings, 0.0, counters, {})
+    stream = ImuStream(settings, 0.0, counters, Alarms())
     sent = packets(seed)
     good, causes = twin(sent)
     assert np.concatenate([t_ns for p in sent for t_ns, _, _ in stream.take(p)]).tolist() == good

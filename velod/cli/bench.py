@@ -76,8 +76,8 @@ def hop(size: Size) -> list[Result]:
     except TimeoutError as error:
         raise RunFailed(str(error)) from None
     return [
-        Result("hop.velod", us["velod"], "raw Zenoh", us["zenoh"], n),
-        Result("hop.zenoh", us["zenoh"], "Unix socket", us["socket"], n),
+        Result("hop.velod", us["velod"], n, peer="raw Zenoh", peer_median_us=us["zenoh"]),
+        Result("hop.zenoh", us["zenoh"], n, peer="Unix socket", peer_median_us=us["socket"]),
     ]
 
 
@@ -103,7 +103,7 @@ def dataflow(seconds: float) -> Result:
     host_us = (out[-1].t_pub_ns - out[0].t_pub_ns) / 1e3
     sensor_s = (out[-1].velocity.t_ns - out[0].velocity.t_ns) / NS_PER_S
     batches = out[-1].velocity.batch_seq - max(0, out[0].velocity.batch_seq)
-    return Result("pipeline.sustained", host_us / batches, None, None, batches, events / seconds * sensor_s / host_us)
+    return Result("pipeline.sustained", host_us / batches, batches, mev_s=events / seconds * sensor_s / host_us)
 
 
 def event_latency(seconds: float) -> Result:
@@ -132,7 +132,7 @@ def event_latency(seconds: float) -> Result:
     ]
     if not waited_ns:
         raise RunFailed("the processes put out no flow")
-    return Result("pipeline.event_to_flow", float(np.median(waited_ns)) / 1e3, None, None, len(waited_ns))
+    return Result("pipeline.event_to_flow", float(np.median(waited_ns)) / 1e3, len(waited_ns))
 
 
 def latency(seconds: float) -> list[Result]:
@@ -152,15 +152,7 @@ def latency(seconds: float) -> list[Result]:
     if not len(legs[LEGS[0]]):
         raise RunFailed("no velocity was made of a batch")
     return [
-        Result(
-            f"latency.{name}",
-            float(np.median(ns)) / 1e3,
-            None,
-            None,
-            len(ns),
-            None,
-            float(np.percentile(ns, 99)) / 1e3,
-        )
+        Result(f"latency.{name}", float(np.median(ns)) / 1e3, len(ns), p99_us=float(np.percentile(ns, 99)) / 1e3)
         for name, ns in legs.items()
     ]
 

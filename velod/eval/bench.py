@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
 import numpy as np
@@ -47,10 +47,11 @@ class Result:
 
     name: str
     median_us: float
-    peer: str | None
-    peer_median_us: float | None
     n: int
-    mev_s: float | None = None
+    _: KW_ONLY
+    peer: str | None = None
+    peer_median_us: float | None = None
+    mev_s: float | None = None  # million events a second, where a unit takes many in
     p99_us: float | None = None
 
     def row(self) -> dict[str, Any]:
@@ -76,7 +77,7 @@ def measure(case: Case, size: Size) -> Result:
     if case.run_peer is not None:
         peer_us = _median_us(case.run_peer, size.peer_repeats if case.slow else size.repeats) / case.peer_per
     mev_s = case.events / (ours_us * case.per) if case.events else None
-    return Result(case.name, ours_us, case.peer, peer_us, repeats, mev_s)
+    return Result(case.name, ours_us, repeats, peer=case.peer, peer_median_us=peer_us, mev_s=mev_s)
 
 
 def _median_us(run: Run, repeats: int, clocked: bool = False) -> float:

@@ -7,6 +7,7 @@ from collections import Counter
 import numpy as np
 from numba import njit
 
+from velod.alarms import Alarms
 from velod.config import IngestSettings
 from velod.events.columns import readonly
 from velod.events.sae import NEVER
@@ -23,7 +24,7 @@ class ImuStream:
     """Drops what is not finite, not later than the sample before, or frozen; counts it as "imu.<cause>"."""
 
     def __init__(
-        self, settings: IngestSettings, time_offset_s: float, counters: Counter[str], alarms: dict[str, str]
+        self, settings: IngestSettings, time_offset_s: float, counters: Counter[str], alarms: Alarms
     ) -> None:
         self.order: PacketOrder[ImuPacket] = PacketOrder(counters)
         self.t_ns = NEVER  # camera clock, of the last good sample
@@ -66,14 +67,8 @@ class ImuStream:
     def _doubt(self, t_ns: I64, accel: F64, gyro: F64) -> None:
         self._units.add(t_ns, accel, gyro)
         frozen = f"the IMU has repeated one sample {self._identical} times"
-        for name, alarm in (
-            (UNITS, self._units.alarm),
-            (FROZEN, frozen if self._identical > self._max_frozen else ""),
-        ):
-            if alarm:
-                self._alarms[name] = alarm
-            else:
-                self._alarms.pop(name, None)
+        self._alarms.say(UNITS, self._units.alarm)
+        self._alarms.say(FROZEN, frozen if self._identical > self._max_frozen else "")
 
 
 @njit(cache=True, nogil=True)

@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from velod.alarms import Alarms
 from velod.config import Settings
 from velod.events.plane_fit import SIZE
 from velod.events.sae import NEVER, age_unit_ns, encode_ages, encode_newest, gather_patches, new_surface
@@ -52,7 +53,7 @@ class IngestStage:
 
     def __init__(self, settings: Settings, calibration: Calibration) -> None:
         self.counters: Counter[str] = Counter()
-        self.alarms: dict[str, str] = {}
+        self.alarms = Alarms()
         self.budget = Budget()
         settings = for_sensor(settings, calibration.left.width, calibration.left.height)
         self._settings = settings
@@ -190,10 +191,8 @@ class IngestStage:
         """An alarm for the camera that lags behind the other."""
         lag_ns = self._left.watermark_ns - self._right.watermark_ns
         for name, behind in (("right", lag_ns), ("left", -lag_ns)):
-            if behind >= self._skew_ns:
-                self.alarms[f"camera.{name}"] = f"the {name} camera lags by more than {self._skew_ns / 1e6:g} ms"
-            else:
-                self.alarms.pop(f"camera.{name}", None)
+            lags = f"the {name} camera lags by more than {self._skew_ns / 1e6:g} ms"
+            self.alarms.say(f"camera.{name}", lags if behind >= self._skew_ns else "")
 
     def _emit_within_budget(self, t_start_ns: int, t_end_ns: int, n_events: int) -> list[Output]:
         """A batch that is not made has no number, so nobody waits for it.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from velod.alarms import Alarms
 from velod.config import ImuSettings, OptimizerSettings
 from velod.optimizer.depth_share import DepthShare
 from velod.optimizer.rotation_check import Offsets
@@ -27,7 +28,7 @@ class CalibrationCheck:
     def __init__(self, settings: OptimizerSettings, imu: ImuSettings, camera: tuple[float, float, float]) -> None:
         """``camera``: f, cx, cy of the rectified left image, px."""
         self.gauges: dict[str, float] = {}
-        self.alarms: dict[str, str] = {}
+        self.alarms = Alarms()
         self._limits = {
             CLOCK: settings.alarm_clock_ms,
             ROWS: settings.alarm_rows_px,
@@ -43,9 +44,7 @@ class CalibrationCheck:
         """Flow and depth of one batch."""
         self._depths.add(depth)
         self.gauges[f"{MATCHES}_percent"] = 100.0 * self._depths.mean
-        self.alarms.pop(MATCHES, None)
-        if alarm := self._depths.alarm:
-            self.alarms[MATCHES] = alarm
+        self.alarms.say(MATCHES, self._depths.alarm)
         self._turn += 1
         if self._turn % EVERY:
             return
@@ -85,11 +84,10 @@ class CalibrationCheck:
     def _judge(self, name: str, unit: str, value_and_sigma: tuple[float, float], text: str) -> None:
         value, sigma = value_and_sigma
         names = (f"{name}_{unit}", f"{name}_sigma_{unit}")
-        self.alarms.pop(name, None)
-        if not math.isfinite(sigma):
+        wrong = bool(self._limits[name]) and abs(value) - SURE * sigma > self._limits[name]
+        self.alarms.say(name, text.format(value, sigma) if wrong else "")
+        if math.isfinite(sigma):
+            self.gauges.update(zip(names, value_and_sigma, strict=True))
+        else:
             for gauge in names:
                 self.gauges.pop(gauge, None)
-            return
-        self.gauges.update(zip(names, value_and_sigma, strict=True))
-        if self._limits[name] and abs(value) - SURE * sigma > self._limits[name]:
-            self.alarms[name] = text.format(value, sigma)

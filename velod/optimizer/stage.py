@@ -319,11 +319,8 @@ class OptimizerStage:
         self._reckoning.gyro_noise = noise.settings.gyro_noise
         self._check.use_noise(noise.settings)
         accel, gyro = noise.excess
-        self.alarms.pop(NOISE, None)
-        if max(accel, gyro) > ALARM_NOISE:
-            self.alarms[NOISE] = (
-                f"the accelerometer has {accel:.1f} and the gyroscope {gyro:.1f} times the noise of the settings"
-            )
+        noisy = f"the accelerometer has {accel:.1f} and the gyroscope {gyro:.1f} times the noise of the settings"
+        self.alarms.say(NOISE, noisy if max(accel, gyro) > ALARM_NOISE else "")
 
     def put_out(self, tau: int) -> list[Velocity | Odometry]:
         """The velocity at ``tau`` from what has been taken in; with its dead reckoning where it is valid."""

@@ -13,6 +13,7 @@ from typing import Final
 
 import numpy as np
 
+from velod.alarms import Alarms
 from velod.config import IngestSettings
 from velod.ingest.imu import ImuStream
 from velod.ingest.ordering import CLOCK_RESTART_NS, ClockRestart
@@ -75,7 +76,7 @@ class ImuBridge:
         if self._stream is None:
             while self._packets and self._is_past(self._packets[0]):
                 self._packets.popleft()
-            self._stream = ImuStream(self._settings, self._time_offset_s, Counter(), {})
+            self._stream = ImuStream(self._settings, self._time_offset_s, Counter(), Alarms())
             self._counted = False
 
     def _is_past(self, data: bytes) -> bool:
