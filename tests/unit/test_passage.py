@@ -55,7 +55,7 @@ def test_the_places_equal_those_of_the_twin(seed: int, towards: int) -> None:
     t_s, reach_s = -rng.uniform(0.0, 0.012, n), rng.uniform(0.0, 0.004, n)
     scores = rng.uniform(-1.0, 1.0, (n, MAX_D + 4)).astype(np.float32)
     surface = surface.astype(np.uint16)
-    found = passages(surface, UNIT_NS, index, x, y, p, t_s, reach_s, towards, scores, 0.3, MAX_D)
+    found = passages(surface, UNIT_NS, index, x, y, p, t_s, reach_s, towards, (scores, 0.3), MAX_D)
     assert (np.diff(found.of) >= 0).all()
     for k in range(n):
         ages_s = surface[p[k]] * (UNIT_NS / 1e9)
@@ -69,15 +69,17 @@ def test_the_choice_equals_that_of_the_twin(seed: int) -> None:
     of = np.repeat(np.arange(15), rng.integers(1, 5, 15))
     disparity = np.where(rng.random(len(of)) < 0.7, rng.uniform(0.0, MAX_D, len(of)), np.nan)
     scores = rng.uniform(-1.0, 1.0, (15, MAX_D + 4)).astype(np.float32)
-    best, rival = choose(Passages(of, np.zeros_like(of)), disparity, scores, 0.75)
+    choice = choose(Passages(of, np.zeros_like(of)), disparity, scores, 0.75)
+    best, rival = choice.best, choice.rival
     for k in range(15):
         own = np.flatnonzero(of == k)
         confirmed = [i for i in own if np.isfinite(disparity[i])]
         if not confirmed:
-            assert (best[k], rival[k]) == (own[0], -1)
+            assert (best[k], rival[k], choice.score[k]) == (own[0], -1, -np.inf)
             continue
         at = {i: likeness(scores[k], disparity[i]) for i in confirmed}
         assert best[k] == max(confirmed, key=lambda i: (at[i], -i))
+        assert choice.score[k] == at[best[k]]
         others = [i for i in confirmed if abs(disparity[i] - disparity[best[k]]) > 2.0]
         others = [i for i in others if at[i] >= 0.75 * at[best[k]]]
         assert rival[k] == (others[-1] if others else -1)
@@ -90,9 +92,8 @@ def test_of_several_edges_only_the_one_that_passes_then_is_a_place() -> None:
     found = left_edges(message.left, UNIT_NS, message.x, message.y, message.p, rect)
     x, y = np.rint(found.x).astype(np.int64), np.rint(found.y).astype(np.int64)
     index = sensor_index(rect.remap_right, (180, 240))
-    anything = np.ones((60, 49), np.float32)
     places = passages(
-        message.right, UNIT_NS, index, x, y, message.p, found.t_s, np.full(60, 1.0 / 300.0), -1, anything, 0.3, 48
+        message.right, UNIT_NS, index, x, y, message.p, found.t_s, np.full(60, 1.0 / 300.0), -1, None, 48
     )
     usable = np.isfinite(found.t_s)
     assert usable.sum() > 40

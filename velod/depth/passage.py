@@ -50,16 +50,17 @@ def passages(
     t_s: F64,
     reach_s: F64,
     towards: int,
-    scores: F32,
-    min_score: float,
+    likeness: tuple[F32, float] | None,
     max_disparity_px: int,
 ) -> Passages:
     """Places x + ``towards`` d, d = 0 .. max, on the rows y where the edge of polarity p has time ``t_s``.
 
     ``surface`` (2, h, w): ages in steps of ``unit_ns`` at sensor pixels, which ``index`` (of ``sensor_index``) finds
     for the rectified x and y (n,). A place is a column whose time is nearer than its neighbours' and within
-    ``reach_s`` (n,), with a correlation ``scores`` (n, > max) of ``min_score`` within a pixel.
+    ``reach_s`` (n,). ``likeness``: correlations (n, k) at whole disparities, and the least that a place has within a
+    pixel; None: any.
     """
+    scores, min_score = likeness or (np.empty((len(x), 0), np.float32), float(NONE))
     room = len(x) * (max_disparity_px // 2 + 1)
     of, disparity = np.empty(room, np.int64), np.empty(room, np.int64)
     m = _passages(
@@ -133,35 +134,44 @@ def _passages(
     return m
 
 
-def choose(places: Passages, disparity: F64, scores: F32, rival_share: float) -> tuple[I64, I64]:
-    """For each of n points, which of its places looks most alike, and the one that could be it as well (-1: none).
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """Of the places of each point."""
+
+    best: I64  # (n,) which looks most alike
+    score: F64  # (n,) its correlation, -inf where it is not confirmed
+    rival: I64  # (n,) one that could be it as well, -1: none
+
+
+def choose(places: Passages, disparity: F64, scores: F32, rival_share: float) -> Choice:
+    """The best place of each of n points.
 
     ``disparity`` (m,): of each place, px, NaN where it is not confirmed: such a one is chosen only where none is, and
     is no rival. ``scores`` (n, k): correlation at whole disparities. A rival has ``rival_share`` of the best score.
     """
-    best, rival = np.empty(len(scores), np.int64), np.empty(len(scores), np.int64)
-    _choose(places.of, disparity, scores, rival_share, best, rival)
-    return best, rival
+    n = len(scores)
+    out = Choice(np.empty(n, np.int64), np.empty(n), np.empty(n, np.int64))
+    _choose(places.of, disparity, scores, rival_share, out.best, out.score, out.rival)
+    return out
 
 
 @njit(cache=True, nogil=True)
-def _choose(of: I64, disparity: F64, scores: F32, rival_share: float, best: I64, rival: I64) -> None:
+def _choose(of: I64, disparity: F64, scores: F32, rival_share: float, best: I64, at_best: F64, rival: I64) -> None:
     m = len(of)
     begin = 0
     for k in range(len(scores)):
         end = begin
-        best[k] = begin
-        at_best = -math.inf
+        best[k], at_best[k] = begin, -math.inf
         while end < m and of[end] == k:
             if math.isfinite(disparity[end]):
                 score = _near(scores[k], disparity[end])
-                if score > at_best:
-                    best[k], at_best = end, score
+                if score > at_best[k]:
+                    best[k], at_best[k] = end, score
             end += 1
         rival[k] = -1
         for i in range(begin, end):
             # False where either is NaN.
             far = abs(disparity[i] - disparity[best[k]]) > SAME_PX
-            if far and _near(scores[k], disparity[i]) >= rival_share * at_best:
+            if far and _near(scores[k], disparity[i]) >= rival_share * at_best[k]:
                 rival[k] = i
         begin = end

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from velod.config import Settings
-from velod.depth.passage import NOWHERE, Passages, choose, passages, sensor_index
+from velod.depth.passage import NOWHERE, Choice, Passages, choose, passages, sensor_index
 from velod.depth.refine import FLAT_EDGE, OUTCOMES, REFINED, Edges, Refined, left_edges, refine
 from velod.depth.surroundings import SAME_TIME_PX, unmatched_share
 from velod.depth.time_surface import TimeSurface, decay_table
-from velod.depth.zncc import Matches, Surface, match
+from velod.depth.zncc import NONE, Matches, Surface, match
 from velod.events.sensor_size import for_sensor
 from velod.geometry.calibration import Calibration
 from velod.geometry.rectify import rectify
@@ -33,8 +33,8 @@ _WHOLE_PX = 1.0
 # share, so that it must not average out.
 _FLAT_EDGE_FACTOR = 4.0
 # Between these shares of unmatched surroundings a place goes from being as good as others to telling nothing: in
-# spins flows are off by 1.0 to 1.4 of their sigmas below and by 1.9 to 2.2 above, most of them too fast.
-_MANY_UNMATCHED, _ALL_UNMATCHED = 0.85, 0.95
+# spins flows are off by 1.0 to 1.2 of their sigmas where half is unmatched, by 1.3 to 1.7 at 0.85, 2.2 where all is.
+_MANY_UNMATCHED, _ALL_UNMATCHED = 0.75, 0.85
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,10 +92,10 @@ class DepthStage:
         batch = self._view(message)
         s = self._settings
         matches = match(batch.left, batch.right_mirrored, batch.x, batch.y, s.block_px, s.max_disparity_px)
-        refined, rivalled = self._refine(batch, matches)
+        refined, choice = self._refine(batch, matches)
         is_refined = refined.outcome == REFINED
         disparity = np.where(is_refined, refined.disparity, matches.disparity)
-        candidates = self._candidates(matches, refined.outcome, rivalled)
+        candidates = self._candidates(matches, refined.outcome, choice)
         accepted = candidates & self._unambiguous(batch, matches, disparity, candidates, is_refined)
         self.counters["points.ambiguous"] += int(np.count_nonzero(candidates & ~accepted))
         sigma_px = self._sigma_px(batch, refined, accepted)
@@ -146,39 +146,40 @@ class DepthStage:
             noise_s=noise_s,
         )
 
-    def _refine(self, batch: _Batch, matches: Matches) -> tuple[Refined, Bools]:
-        """Plane coincidence wherever the right edge passes with the left one: the match that looks most alike of
-        those that it confirms, of each point; and whether another one could be it as well."""
+    def _refine(self, batch: _Batch, matches: Matches) -> tuple[Refined, Choice]:
+        """Plane coincidence wherever the right edge passes with the left one: of each point the match that looks most
+        alike of those that it confirms, and how that was chosen."""
         message, edges, n = batch.message, batch.edges, len(batch.x)
         places, seed = Passages(np.arange(n), np.full(n, NOWHERE)), np.full(n, np.nan)
         if self._settings.refine:
             places = passages(
                 message.right, message.unit_ns, self._right_index, batch.x, batch.y, message.p,
                 edges.t_s, batch.reach_s, -1,
-                matches.scores, self._settings.min_zncc, self._settings.max_disparity_px,
+                (matches.scores, self._settings.min_zncc), self._settings.max_disparity_px,
             )  # fmt: skip
             at_place = places.disparity + (edges.x - batch.x)[places.of]
             seed = np.where(places.disparity == NOWHERE, matches.disparity[places.of], at_place)
         found = refine(
             edges, message.right, message.unit_ns, message.p, places.of, seed, self._rectification, batch.noise_s
         )
-        best, rival = choose(places, found.disparity, matches.scores, _RIVAL_SHARE)
-        refined = found[best]
+        choice = choose(places, found.disparity, matches.scores, _RIVAL_SHARE)
+        refined = found[choice.best]
         count = np.bincount(refined.outcome, minlength=len(OUTCOMES))
         for number, name in enumerate(OUTCOMES):
             if number != REFINED and count[number]:
                 self.counters[f"unrefined.{name}"] += int(count[number])
-        return refined, rival >= 0
+        return refined, choice
 
-    def _candidates(self, matches: Matches, outcome: NDArray[np.uint8], rivalled: Bools) -> Bools:
+    def _candidates(self, matches: Matches, outcome: NDArray[np.uint8], choice: Choice) -> Bools:
         """(n,) which matches are worth checking: refined without a rival, or strong where that cannot be had."""
         s = self._settings
         matched = np.isfinite(matches.disparity)
         is_refined = np.asarray(outcome == REFINED)
         # On real events every sixth match that refinement could have confirmed and did not is off by half its depth.
         trusted = is_refined | (outcome == FLAT_EDGE) if s.refine and s.block_only == "flat" else matched
-        alike = matches.score >= s.min_zncc
-        strong = alike & (is_refined | (matched & trusted & matches.enclosed))
+        score = np.where(is_refined, choice.score, np.where(matches.enclosed, matches.score, NONE))
+        strong = matched & trusted & (score >= s.min_zncc)
+        rivalled = strong & (choice.rival >= 0)
         self.counters["points.no_match"] += int(np.count_nonzero(~matched))
         self.counters["points.unconfirmed"] += int(np.count_nonzero(matched & ~trusted))
         self.counters["points.low_zncc"] += int(np.count_nonzero(matched & trusted & ~strong))
@@ -208,17 +209,22 @@ class DepthStage:
         """
         s, at, message = self._settings, np.flatnonzero(candidates), batch.message
         x_right, y = batch.x[at] - np.rint(disparity[at]).astype(np.int64), batch.y[at]
-        # Mirrored, the right image takes the left one's part.
-        mirrored_x = self._rectification.width - 1 - x_right
-        back = match(batch.right_mirrored, batch.left, mirrored_x, y, s.block_px, s.max_disparity_px)
         places = passages(
             message.left, message.unit_ns, self._left_index, x_right, y, message.p[at],
-            batch.edges.t_s[at], batch.reach_s[at], 1, back.scores, s.min_zncc, s.max_disparity_px,
+            batch.edges.t_s[at], batch.reach_s[at], 1, None, s.max_disparity_px,
         )  # fmt: skip
+        # Where there is but one place likeness has nothing to choose.
+        asked = ~is_refined[at] | (np.bincount(places.of, minlength=len(at)) > 1)
+        # Mirrored, the right image takes the left one's part.
+        mirrored_x = self._rectification.width - 1 - x_right[asked]
+        back = match(batch.right_mirrored, batch.left, mirrored_x, y[asked], s.block_px, s.max_disparity_px)
+        scores = np.full((len(at), back.scores.shape[1]), NONE)
+        scores[asked] = back.scores
         at_place = np.where(places.disparity == NOWHERE, np.nan, places.disparity)
-        best, _ = choose(places, at_place, back.scores, _RIVAL_SHARE)
+        found = at_place[choose(places, at_place, scores, _RIVAL_SHARE).best]
+        found[~is_refined[at]] = back.disparity[~is_refined[at][asked]]
         out = np.full(len(disparity), np.nan)
-        out[at] = np.where(is_refined[at], at_place[best], back.disparity)
+        out[at] = found
         return out
 
     def _sigma_px(self, batch: _Batch, refined: Refined, accepted: Bools) -> F64:
