@@ -30,8 +30,8 @@ _REACH_NOISES = 2.5
 # The way back ends at a whole pixel, and began at one.
 _WHOLE_PX = 1.0
 # Block matching along an edge that lies in the row: twice the spread of other edges, and an error that neighbours
-# share, so that it must not average out.
-_FLAT_EDGE_FACTOR = 4.0
+# share, so that it must not average out over the tens of a batch.
+_FLAT_EDGE_FACTOR = 10.0
 # Between these shares of unmatched surroundings a place goes from being as good as others to telling nothing: in
 # spins flows are off by 1.0 to 1.2 of their sigmas where half is unmatched, by 1.3 to 1.7 at 0.85, 2.2 where all is.
 _MANY_UNMATCHED, _ALL_UNMATCHED = 0.75, 0.85
