@@ -8,7 +8,16 @@ import pytest
 from tests.moving_edges import T0_NS, calibration, edges, event_batches, settings
 from velod.ingest.budget import BAND_ROWS, LEAST_ROWS, Budget
 from velod.ingest.stage import IngestStage
-from velod.runtime.budget import EVENT_GRACE_S, GRACE_S, LEAST_SELECTION, MAX_WAITING, NO_PACKET, LoadShedder
+from velod.runtime.budget import (
+    EVENT_GRACE_S,
+    GRACE_S,
+    LEAST_SELECTION,
+    MAX_WAITING,
+    NO_PACKET,
+    STANDING_S,
+    STANDING_SELECTION,
+    LoadShedder,
+)
 from velod.types import ImuSamples, StereoBatch
 
 TARGET_S = 0.05
@@ -42,6 +51,27 @@ def test_late_workers_get_fewer_events_then_no_batches_and_all_again_when_they_a
     now_s = run(load, 0.0, now_s, 1.0)
     assert 0.5 < load.budget().selection < 0.7
     run(load, 0.0, now_s, 1.0)
+    assert load.budget() == Budget(room=MAX_WAITING)
+
+
+def test_a_queue_that_stands_is_drained_by_fewer_events_but_half_of_them_stay() -> None:
+    load = LoadShedder(10.0 * STANDING_S)
+    now_s = run(load, 1.2 * STANDING_S, 0.0, GRACE_S)
+    assert load.budget() == Budget(room=MAX_WAITING), "a moment's queue is none that stands"
+    now_s = run(load, 1.2 * STANDING_S, now_s, 0.5)
+    assert STANDING_SELECTION < load.budget().selection < 0.9
+    now_s = run(load, 9.0 * STANDING_S, now_s, 3.0)
+    assert load.budget() == Budget(selection=STANDING_SELECTION, room=MAX_WAITING)
+    run(load, 0.4 * STANDING_S, now_s, 1.1)
+    assert load.budget() == Budget(room=MAX_WAITING)
+
+
+def test_a_queue_that_is_short_now_and_then_does_not_stand() -> None:
+    load = LoadShedder(10.0 * STANDING_S)
+    now_s = 0.0
+    for _ in range(10):
+        now_s = run(load, 3.0 * STANDING_S, now_s, 0.8 * GRACE_S)
+        now_s = run(load, 0.9 * STANDING_S, now_s, 0.01)
     assert load.budget() == Budget(room=MAX_WAITING)
 
 

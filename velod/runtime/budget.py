@@ -25,6 +25,10 @@ CALM = 0.5
 """Shares grow while nothing is later than this part of the target."""
 LEAST_SELECTION = 0.1
 """With fewer events a batch costs hardly less, and says little: then there are fewer batches."""
+STANDING_S = 0.025
+"""Where every batch has to wait for so long, for as long as the grace, a queue stands that nothing drains ..."""
+STANDING_SELECTION = 0.5
+"""... and it costs latency alone: so much less is selected at the most until it is gone."""
 LEAST_BATCHES = 0.1
 NO_BATCH = 2.0
 """While a batch is later than this many targets, no further one is made."""
@@ -45,9 +49,11 @@ class Share:
     target_s: float
     least: float
     grace_s: float = GRACE_S
+    standing_s: float = math.inf
     value: float = 1.0
     _last_s: float = math.inf
     _late_s: float = math.inf  # since when there has been delay
+    _standing_since_s: float = math.inf  # since when a queue has stood
     _patience_s: float = -math.inf  # no further fall before: the last one has not had its effect
 
     def note(self, delay_s: float, now_s: float) -> None:
@@ -55,12 +61,18 @@ class Share:
         elapsed_s = max(0.0, now_s - self._last_s)
         self._last_s = now_s
         self._late_s = min(self._late_s, now_s) if delay_s > self.target_s else math.inf
+        self._standing_since_s = min(self._standing_since_s, now_s) if delay_s > self.standing_s else math.inf
         if delay_s > self.target_s:
-            if now_s >= max(self._patience_s, self._late_s + self.grace_s):
-                self.value = max(self.least, self.value * FALL)
-                self._patience_s = now_s + self.target_s
-        elif delay_s < CALM * self.target_s:
+            self._fall(self._late_s, self.least, self.target_s)
+        elif delay_s > self.standing_s:
+            self._fall(self._standing_since_s, STANDING_SELECTION, self.grace_s)
+        elif delay_s < CALM * min(self.target_s, self.standing_s):
             self.value = min(1.0, self.value + RISE_PER_S * min(elapsed_s, _PERIOD_S))
+
+    def _fall(self, since_s: float, least: float, pause_s: float) -> None:
+        if self.value > least and self._last_s >= max(self._patience_s, since_s + self.grace_s):
+            self.value = max(least, self.value * FALL)
+            self._patience_s = self._last_s + pause_s
 
 
 @dataclass(slots=True)
@@ -88,7 +100,7 @@ class LoadShedder:
     _used: tuple[float, float] = (1.0, 1.0)
 
     def __post_init__(self) -> None:
-        self._selection = Share(self.target_s, LEAST_SELECTION)
+        self._selection = Share(self.target_s, LEAST_SELECTION, standing_s=STANDING_S)
         self._slices = Share(self.event_target_s, LEAST_SELECTION, EVENT_GRACE_S)
         by_event = self.event_target_s > 0.0
         grace_s = EVENT_GRACE_S if by_event else GRACE_S
