@@ -34,6 +34,14 @@ class UpsideDown(Motion):
         return exp(np.array([-1.3, 0.3, -0.2])) @ exp(self.w_B * t)
 
 
+class Passed(Motion):
+    """What the flows tell while something fills the view that sets out at 1 s, to 1.2 m/s, and is gone at 2 s."""
+
+    def v_B(self, t):
+        share = np.clip((t - 1.0) / 0.3, 0.0, 1.0) if t < 2.0 else 0.0
+        return super().v_B(t) - self.R_WB(t).T @ np.array([0.0, 1.2 * share, 0.0])
+
+
 def run(stream, calibration=CALIBRATION, **optimizer):
     stage = OptimizerStage(from_tree({"optimizer": optimizer}), calibration)
     return [v for m in stream for v in stage.handle(m) if isinstance(v, Velocity)], stage
@@ -161,6 +169,20 @@ def test_a_jump_of_the_clock_starts_the_estimate_anew(by_s):
     assert next(v.t_ns for v in after if v.valid) < (1.5 + by_s) * 1e9
     right = [np.linalg.norm(v.v_B - FLIGHT.v_B(v.t_ns * 1e-9 - by_s)) for v in after if v.valid]
     assert np.mean(right) < USUAL_ERROR
+
+
+@pytest.mark.parametrize("motion", [FLIGHT, STEADY])
+def test_a_view_full_of_what_moves_by_itself_is_told_from_the_surroundings(motion):
+    """0.2 s after it has set out: degraded or lost, the truth within what is told, and the way back is short."""
+    passed = Passed(motion.w_B, motion.v0_W, motion.amplitude, motion.rate)
+    velocities, _ = run(messages(passed, 3.0))
+    meanwhile = between(velocities, 1.2, 2.0)
+    assert not any(v.state == "tracking" for v in meanwhile)
+    assert any("does the scene move" in v.reason for v in meanwhile)
+    off = [(v.v_B - motion.v_B(v.t_ns * 1e-9), v.cov) for v in meanwhile]
+    assert np.mean([e @ np.linalg.solve(cov, e) for e, cov in off]) < 6.0
+    assert velocities[-1].state == "tracking"
+    assert errors(between(velocities, 2.8, 3.0), motion).max() < 2 * USUAL_ERROR
 
 
 def test_times_before_zero_are_times_as_any():

@@ -16,19 +16,22 @@ PROBATION = 2 * BATCHES
 """Batches that must agree again after that."""
 MOST = 300.0
 """One batch says no more than this."""
+LASTING, LASTING_USUAL, LASTING_MOST = 24, 2.5, 10.0
+"""The same over more batches, of which none says much: a scene that sets out slowly. Sound recordings reach 1.65."""
 
 
 class Consistency:
     """Average of the squared Mahalanobis distances of the last batches from their prediction, over 3."""
 
     def __init__(self) -> None:
-        self._average = 1.0
+        self._average = self._lasting = 1.0
         self._hopeless = 0
         self._on_probation = 0
 
     def note(self, squared_distance: float) -> None:
         """One batch, with three degrees of freedom."""
         self._average += (min(squared_distance / 3.0, MOST) - self._average) / BATCHES
+        self._lasting += (min(squared_distance / 3.0, LASTING_MOST) - self._lasting) / LASTING
         self._hopeless = self._hopeless + 1 if self._average > HOPELESS else 0
         self._on_probation = max(0, self._on_probation - 1)
 
@@ -40,8 +43,9 @@ class Consistency:
     @property
     def disagreement(self) -> str:
         """In words; empty where flow and IMU agree."""
-        if self._average > USUAL:
-            return f"flow and IMU disagree: {self._average**0.5:.1f} times what their noise explains"
+        if self._average > USUAL or self._lasting > LASTING_USUAL:
+            times = max(self._average, self._lasting) ** 0.5
+            return f"flow and IMU disagree: {times:.1f} times what their noise explains"
         return "flow and IMU disagreed a moment ago" if self._on_probation else ""
 
     @property
@@ -56,4 +60,5 @@ class Consistency:
 
     def start_anew(self) -> None:
         """Nothing that was said before is held against the next batches, but they are on probation."""
-        self._average, self._hopeless, self._on_probation = 1.0, 0, PROBATION
+        self._average = self._lasting = 1.0
+        self._hopeless, self._on_probation = 0, PROBATION

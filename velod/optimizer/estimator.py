@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -20,6 +19,7 @@ from velod.optimizer.depth_share import cameras_disagree
 from velod.optimizer.equations import EquationMaker, Equations, Prediction
 from velod.optimizer.flow_equation import BIN_NS, COMMON, RIDGE, Bins, Fit, Rows
 from velod.optimizer.frame import Rate
+from velod.optimizer.head import Head
 from velod.optimizer.imu_noise import ImuNoise
 from velod.optimizer.inertial import InertialMemory
 from velod.optimizer.interval import Interval
@@ -28,6 +28,7 @@ from velod.optimizer.rotation_check import RotationCheck
 from velod.optimizer.small import squared_distance
 from velod.optimizer.standstill import QUIET_EVENTS, QUIET_NS, Standstill
 from velod.optimizer.window import Window
+from velod.optimizer.witness import Witness
 from velod.types import F64, NS_PER_S, DepthBatch, FlowBatch, ImuSamples
 
 OPEN_NS = 60_000_000
@@ -48,35 +49,6 @@ MAX_CARRIED = 32
 """Predictions of one head that are remembered: a batch asks for some of them twice."""
 MAX_DIRECTION_SIGMA = 0.5
 """rad; gravity's direction must be known this well before its norm says anything."""
-
-
-@dataclass(frozen=True, slots=True)
-class Head:
-    """The estimate at the end of the newest batch: [v_B, b_a, b_w, g_L] with covariance (12, 12)."""
-
-    t_ns: int
-    v_B: F64
-    b_a: F64
-    b_w: F64
-    g_L: F64
-    R_LB: F64
-    cov: F64
-    common: F64  # (3,) common errors of the flows, flow_equation.COMMON
-    common_cov: F64  # (3, 3)
-    e_L: F64  # (3,) e of v_B = R_BL (s_L + e), m/s
-
-    def e_at(self, t_ns: int) -> F64:
-        """e (3,) at ``t_ns``, from here on along the slope of gravity."""
-        return self.e_L - (t_ns - self.t_ns) * 1e-9 * self.g_L
-
-    @property
-    def gravity_direction_sigma(self) -> float:
-        """Standard deviation of the direction of g_L, rad."""
-        g, cov = self.g_L, self.cov[9:, 9:]
-        squared_norm = float(g @ g)
-        # the trace of the covariance across g
-        across = float(cov[0, 0] + cov[1, 1] + cov[2, 2] - g @ cov @ g / squared_norm)
-        return math.sqrt(max(across, 0.0) / squared_norm)
 
 
 class Estimator:
@@ -100,6 +72,7 @@ class Estimator:
         self._segments = int(np.ceil(o.window_s / o.knot_s)) + 1
         self._bias_margins = (1.0, 1.0)  # on the specified sigmas of b_a and b_w
         self.consistency = Consistency()
+        self._witness = Witness()
         self.rotation_check = rotation_check or RotationCheck(
             o.imu_clock_sigma_ms * 1e-3, settings.imu.gyro_noise, o.correct_imu_clock
         )
@@ -163,6 +136,7 @@ class Estimator:
         elif still:
             self._add_standstill(flow.t_ns)
         self._solve_head(self.head.t_ns if late and self.head is not None else flow.t_ns)
+        self._hear_witness()
         self._keep_error_small()
 
     def _look_at_noise(self, t_ns: int) -> None:
@@ -208,6 +182,28 @@ class Estimator:
             self.window.widen_bias_prior(margins)
             self._count("bias.prior_changed")
 
+    def _hear_witness(self) -> None:
+        """Compare the newest estimate with the one that the IMU alone has carried on since flow and IMU disagree."""
+        head = self.head
+        if head is None:
+            return
+        suspicious = bool(self.consistency.disagreement)
+        self._witness.watch(head, suspicious=suspicious)
+        before = self._witness.head
+        if before is not None and self.memory.covers(before.t_ns, head.t_ns):
+            p = self._preintegrate(before.t_ns, head.t_ns, before.b_a, before.b_w)
+            carried = inertial_residual.carry(p, before.v_B, before.R_LB, before.g_L, before.cov)
+            self._witness.compare(head, *carried, suspicious=suspicious)
+
+    def _doubt(self, t_ns: int) -> F64:
+        """Covariance (3, 3) in B at ``t_ns`` for what the estimate has moved away from the witness."""
+        head, doubt_L = self.head, self._witness.doubt_L
+        if head is None or not doubt_L.any():
+            return np.zeros((3, 3))
+        R_LB = head.R_LB @ self._carry(head, t_ns)[0].R_gamma
+        doubt_B: F64 = R_LB.T @ doubt_L @ R_LB
+        return doubt_B
+
     def _correct_stamps(self, t_ns: int) -> None:
         """Take the delay of the events out of their stamps, once it is certain."""
         if (step_s := self.rotation_check.advance(self.memory, t_ns)) != 0.0:
@@ -231,7 +227,7 @@ class Estimator:
         predicted = self.predict(t_ns)
         if predicted is None:
             return None
-        v, cov = predicted[0], predicted[1] * self.consistency.factor
+        v, cov = predicted[0], predicted[1] * self.consistency.factor + self._doubt(t_ns)
         if not self._standstill.goes_on(self.memory, t_ns, self._biases()[1]):
             return v, cov
         sigma = max(self._still_sigma(), RESTING_SIGMA)
@@ -279,6 +275,16 @@ class Estimator:
     def biases_as_specified(self) -> bool:
         """Whether no bias has been found that was not drawn with its sigma."""
         return max(self._bias_margins) < EXCESSIVE
+
+    @property
+    def disagreement(self) -> str:
+        """Of flow and IMU, in words; empty where they agree."""
+        return self.testimony or self.consistency.disagreement
+
+    @property
+    def testimony(self) -> str:
+        """How far the estimate has left what the IMU alone made of it, in words; empty while noise explains that."""
+        return self._witness.testimony
 
     @property
     def implausible_bias(self) -> str:

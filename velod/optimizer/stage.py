@@ -361,7 +361,7 @@ class OptimizerStage:
         """State, reason and validity of an estimate."""
         sigma = float(np.sqrt(np.linalg.eigvalsh(cov)[-1]))
         limit = VALID_SIGMA + VALID_SHARE * float(np.linalg.norm(v))
-        disagreement = self._estimator.consistency.disagreement
+        disagreement = self._estimator.disagreement
         if self._estimator.consistency.on_probation:
             self._was_valid, self._was_lost = False, True
             return TrackingState.LOST, disagreement, False
@@ -394,7 +394,8 @@ class OptimizerStage:
         return TrackingState.TRACKING, "", True
 
     def _uncertain(self, tau: int, sigma: float) -> str:
-        return "; ".join(filter(None, (f"sigma {sigma:.2f} m/s", self._without_flow(tau))))
+        why = (f"sigma {sigma:.2f} m/s", self._without_flow(tau), self._estimator.testimony)
+        return "; ".join(filter(None, why))
 
     def _without_flow(self, tau: int) -> str:
         """For how long there has been none, and why; empty where there is flow."""
