@@ -104,7 +104,7 @@ class GapCounter:
 
     def see(self, seq: int) -> None:
         """A message arrived."""
-        if self._next < 0:
+        if self._next < 0 or (seq == self._next and not self._missing):
             self._next = seq + 1
         elif seq >= self._next:
             self._advance(seq)

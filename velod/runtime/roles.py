@@ -326,9 +326,9 @@ class OptimizerShell(WorkerShell):
     def every_round(self) -> None:
         """Go on without ingest, and take over from another optimizer, where it is time to."""
         for samples in [] if self._bridge is None else self._bridge.due(time.monotonic()):
-            cause = Envelope(samples, time.time_ns(), 0)
-            with self.survived(key(IMU_SENSOR, self.rig), cause):
-                self.publish(self.stage.handle(samples), cause)
+            at, cause = key(IMU_SENSOR, self.rig), Envelope(samples, time.time_ns(), 0)
+            outputs = self.survived(at, cause, self.stage.handle, samples) or ()
+            self.survived(at, cause, self.publish, outputs, cause)
         self._publish_turns(self._succession.look(time.monotonic()))
 
     def _publish_turns(self, turns: Sequence[Turn[_Output]]) -> None:

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from threading import Event
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import zenoh
 
@@ -29,6 +29,8 @@ from velod.wire import Envelope, WireError, decode
 from velod.wire.topics import ALIVE, HEALTH, Topic, key, parts
 
 log = logging.getLogger("velod")
+
+T = TypeVar("T")
 
 POLL_S = 0.1
 """How long the main thread sleeps at the most before it looks at signals and at the clock."""
@@ -215,23 +217,19 @@ class WorkerShell:
             self.received(item.source, envelope)
             return
         self._note_arrival(topic, item.key, envelope.message)
-        outputs: Sequence[Message] = []
-        with self.survived(item.key, envelope):
-            outputs = self.handle(envelope.message)
-        with self.survived(item.key, envelope):
-            self.publish(outputs, envelope)
+        outputs = self.survived(item.key, envelope, self.handle, envelope.message) or ()
+        self.survived(item.key, envelope, self.publish, outputs, envelope)
         if self._tidying is not None:
-            with self.survived(item.key, envelope):
-                self._tidying.tidy()
+            self.survived(item.key, envelope, self._tidying.tidy)
 
-    @contextmanager
-    def survived(self, at: str, envelope: Envelope) -> Iterator[None]:
-        """A worker outlives whatever one message does to it."""
+    def survived(self, at: str, cause: Envelope, do: Callable[..., T], *arguments: Any) -> T | None:
+        """What ``do`` returns; None where it fails, as a worker outlives whatever one message does to it."""
         try:
-            yield
+            return do(*arguments)
         except Exception as e:
             name = f"error.{type(e).__name__}"
-            self.count(name, f"{name} on {at}, seq {envelope.message.seq}", with_trace=True)
+            self.count(name, f"{name} on {at}, seq {cause.message.seq}", with_trace=True)
+            return None
 
     def _note_arrival(self, topic: Topic, at: str, message: Any) -> None:
         self.count(f"in.{topic.name}")
