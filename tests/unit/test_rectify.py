@@ -1,5 +1,7 @@
 """Rectification: the same point lies in the same row of both images, and the tables agree with each other."""
 
+from dataclasses import fields
+
 import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
@@ -7,7 +9,7 @@ from scipy.ndimage import map_coordinates
 from velod.geometry import so3
 from velod.geometry.calibration import Calibration, Camera
 from velod.geometry.camera import distort, pixels
-from velod.geometry.rectify import Rectification, rectify
+from velod.geometry.rectify import Rectification, rectified_pair, rectify
 
 PLAIN = Camera(346, 260, 231.5, 231.5, 172.3, 130.8)
 RADTAN = Camera(346, 260, 249.7, 248.4, 176.7, 129.5, "radtan", (-0.379, 0.154, 0.00114, -0.0019))
@@ -128,3 +130,19 @@ def test_sensor_pixels_beyond_the_lens_model_are_nan_in_every_table() -> None:
     assert np.isnan(rect.left_covector[0, 0]).all()
     assert np.isfinite(rect.left_xy[150, 150]).all()
     assert np.isnan(rect.left_xy[..., 0]).mean() < 0.9
+
+
+def test_tables_are_made_once_for_one_calibration_and_anew_for_another() -> None:
+    first, again, wider = (
+        rectify(Calibration(RADTAN, RADTAN, np.eye(3), np.array([-baseline_m, 0.0, 0.0])))
+        for baseline_m in (0.1, 0.1, 0.2)
+    )
+    assert again is first
+    assert wider.baseline_m == pytest.approx(2.0 * first.baseline_m)
+
+
+@PAIRS
+def test_the_pair_is_the_same_with_tables_and_without(calib: Calibration) -> None:
+    pair, rect = rectified_pair(calib), rectify(calib)
+    for f in fields(pair):
+        np.testing.assert_array_equal(getattr(pair, f.name), getattr(rect, f.name))

@@ -26,6 +26,7 @@ import numpy as np
 import zenoh
 
 from velod.config import Settings, ZenohSettings
+from velod.runtime.callbacks import direct
 from velod.runtime.outlet import Outlet
 from velod.runtime.process import ChildProcess, stop_all
 from velod.runtime.session import introducer_endpoint, open_session
@@ -108,9 +109,10 @@ class _Stage:
 
 
 class _Shell(WorkerShell):
-    """A worker that notes how long each message took to reach its stage."""
+    """A worker that notes how long each message took to reach its stage, which takes it as ingest does."""
 
     inputs: ClassVar[dict[Topic, int]] = {EVENTS: -1}
+    in_place: ClassVar[bool] = True
 
     def __init__(self, session: zenoh.Session, settings: Settings) -> None:
         super().__init__(session, settings, "hop", "hop-0", _Stage())
@@ -148,8 +150,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     with ExitStack() as stack:
         session = stack.enter_context(open_session(settings.zenoh))
-        callback = zenoh.handlers.Callback(arrived, indirect=False)
-        stack.enter_context(session.declare_subscriber(_RAW_KEY, callback))
+        stack.enter_context(session.declare_subscriber(_RAW_KEY, direct(arrived)))
         plain = socket.socket(socket.AF_UNIX)
         plain.connect(path)
         Thread(target=_receive, args=(plain, plain_ns, stop), daemon=True).start()
