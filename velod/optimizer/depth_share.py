@@ -9,6 +9,9 @@ LEAST_SHARE = 0.1
 58 to 90 %. Below this a third of the depths and more would be such matches."""
 ENOUGH = 50
 """Selected events of a batch from which on its share means something."""
+PROBATION_NS = 800_000_000
+"""A right camera that is late by 60 to 100 ms finds its own past on the surfaces, 30 to 70 % of the events at a wrong
+disparity, for 0.2 to 0.7 s between two batches of which it finds nothing: so long an estimate waits to be valid."""
 _NEWEST = 0.05
 """Weight of the newest batch in the mean: a quarter of a second at the usual rate."""
 
