@@ -2,7 +2,8 @@
 
 Zenoh makes the pool of a session at its first large message, and a receiver attaches to it then: up to 0.2 s during
 which a process stands still, and with it the first batches of a run. So those that will send large messages, driver
-and ingest, send one at their start, which all others take and ignore; ingest sends one more to greet a new worker.
+and ingest, send one at their start, which is taken and ignored by those that will take such messages, and by nobody
+else: whoever takes one holds the pool. Ingest sends one more to greet a new worker.
 """
 
 from __future__ import annotations

@@ -204,6 +204,7 @@ class OptimizerShell(WorkerShell):
     """
 
     inputs: ClassVar[dict[Topic, int]] = {FLOW: OVERTAKING, DEPTH: OVERTAKING, IMU: 0}
+    takes_large: ClassVar[bool] = False
     poll_s: ClassVar[float] = 0.01
     _REMEMBERED = 256
     _PEERS: ClassVar[dict[str, type]] = {VELOCITY.name: Velocity, ODOMETRY.name: Odometry}

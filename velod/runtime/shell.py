@@ -52,6 +52,8 @@ class WorkerShell:
     poll_s: ClassVar[float] = POLL_S
     sends_large: ClassVar[bool] = False
     """Whether what it publishes goes through shared memory."""
+    takes_large: ClassVar[bool] = True
+    """Whether what it takes does: then it holds the memory of those who send."""
     in_place: ClassVar[bool] = False
     """Whether the stage takes columns that lie in the message, read-only and at any address."""
 
@@ -78,7 +80,8 @@ class WorkerShell:
         """Handle messages until ``stop`` is set; then leave nothing declared."""
         with ExitStack() as stack:
             stack.enter_context(self.outlet)
-            stack.enter_context(prime.listen(self.session, self.rig))
+            if self.takes_large:
+                stack.enter_context(prime.listen(self.session, self.rig))
             self.subscribe(stack)
             self._wait_for_consumers(stop)
             if self.sends_large:

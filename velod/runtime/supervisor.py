@@ -20,7 +20,6 @@ import zenoh
 
 from velod.config import Settings
 from velod.geometry.calibration import Calibration
-from velod.runtime import prime
 from velod.runtime.health import HealthReporter
 from velod.runtime.outlet import Outlet
 from velod.runtime.pools import PoolKeeper
@@ -107,7 +106,6 @@ class Supervisor(Stacked):
         # Health is for whoever can follow, even in a lossless replay.
         self._outlet = stack.enter_context(Outlet(self.session, self._settings.rig.name))
         self._watch_liveliness(stack)
-        stack.enter_context(prime.listen(self.session, self._settings.rig.name))
         stack.callback(self.stop_workers)
         for name in self._names():
             self._slots[name] = slot = _Slot(name, stage_of(name) in map(stage_of, self._slots))
