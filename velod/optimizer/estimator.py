@@ -15,7 +15,7 @@ from velod.optimizer import attitude, degeneracy, flow_equation, inertial_residu
 from velod.optimizer.attitude import Attitude
 from velod.optimizer.bias_prior import EXCESSIVE, implausible, likely_margins
 from velod.optimizer.consistency import Consistency
-from velod.optimizer.depth_share import PROBATION_NS, cameras_disagree
+from velod.optimizer.depth_share import Probation, cameras_disagree
 from velod.optimizer.equations import EquationMaker, Equations, Prediction
 from velod.optimizer.flow_equation import BIN_NS, COMMON, RIDGE, Bins, Fit, Rows
 from velod.optimizer.frame import Rate
@@ -71,7 +71,7 @@ class Estimator:
         self.memory = InertialMemory(o.window_s + 3.0)
         self._segments = int(np.ceil(o.window_s / o.knot_s)) + 1
         self._bias_margins = (1.0, 1.0)  # on the specified sigmas of b_a and b_w
-        self._cameras_disagreed_ns = NEVER
+        self.probation = Probation()
         self.consistency = Consistency()
         self._witness = Witness()
         self.rotation_check = rotation_check or RotationCheck(
@@ -287,10 +287,6 @@ class Estimator:
         """How far the estimate has left what the IMU alone made of it, in words; empty while noise explains that."""
         return self._witness.testimony
 
-    def cameras_on_probation(self, t_ns: int) -> bool:
-        """Whether so few events had a depth not long before ``t_ns`` that those which have may be wrong matches."""
-        return t_ns - self._cameras_disagreed_ns < PROBATION_NS
-
     @property
     def implausible_bias(self) -> str:
         """What is taken for a bias and cannot be one, in words; empty if nothing is."""
@@ -324,9 +320,10 @@ class Estimator:
 
     def _equations(self, flow: FlowBatch, depth: DepthBatch) -> Equations | None:
         """Of the events of which both flow and depth speak; None where they are too few."""
-        if cameras_disagree(depth):
+        disagree = cameras_disagree(depth)
+        self.probation.note(flow.t_ns, disagree=disagree)
+        if disagree:
             self._count("fit.few_depths")
-            self._cameras_disagreed_ns = flow.t_ns
             self.lacking = _lack(flow, depth)
             return None
         earliest_ns = int(self.memory.t_ns[0])

@@ -374,7 +374,7 @@ class OptimizerStage:
             if self._estimator.batches < MIN_BATCHES:
                 why = "" if self._estimator.batches else f"; the newest: {self._estimator.lacking}"
                 return state, f"{self._estimator.batches} usable batches{why}", False
-            if self._estimator.cameras_on_probation(tau):
+            if self._estimator.probation.lasts(tau):
                 return state, "a moment ago the cameras did not see the same", False
             seen_ns = tau - self._estimator.first_usable_t_ns
             # nothing may speak against IMU or calibration: what is uncertain for that is wrong
