@@ -38,7 +38,7 @@ POLL_S = 0.02
 FIRST_DELAY_S, LAST_DELAY_S = 0.1, 10.0
 STEADY_S = 10.0
 """A worker that lived so long starts with no delay again."""
-HEAD_START_S = 10.0
+HEAD_START_S = 30.0
 """So long at the most do a stage's further workers wait for the first of each: all at once, all would come late.
 Then they load with low priority, or those that work already could not keep up meanwhile."""
 REMEMBERED_S = 60.0
