@@ -288,20 +288,14 @@ def _take_in_turn(
     n_reserve = 0
     while open_cells > 0 and n < chosen.size:
         # The cells of one round in random order: a last, incomplete round must not favour the top of the image.
-        for i in range(open_cells - 1, 0, -1):
-            state = _mix(state)
-            j = _below(state, i + 1)
-            cells[i], cells[j] = cells[j], cells[i]
+        state = _shuffle(cells, open_cells, state)
         still_open = 0
         for i in range(open_cells):
             cell = cells[i]
             for _ in range(min(DRAWS, top[cell] - cell_end[cell])):
-                # Draw without replacement: the drawn one is overwritten by the last of those left.
                 state = _mix(state)
-                j = cell_end[cell] + _below(state, top[cell] - cell_end[cell])
-                flat = index[j]
+                flat = _draw(index, cell_end[cell], top[cell], state)
                 top[cell] -= 1
-                index[j] = index[top[cell]]
                 k, r, c = flat // (h * w), flat // w % h, flat % w
                 _ages(surface[k], r, c, t_end_ns, memory_ns, age)
                 if burst:
@@ -325,6 +319,25 @@ def _take_in_turn(
         chosen[n] = reserve[i]
         n += 1
     return n
+
+
+@njit(cache=True, nogil=True)
+def _shuffle(cells: I64, n: int, state: np.uint64) -> np.uint64:
+    """Put the first n into random order (Fisher-Yates); the state after that."""
+    for i in range(n - 1, 0, -1):
+        state = _mix(state)
+        j = _below(state, i + 1)
+        cells[i], cells[j] = cells[j], cells[i]
+    return state
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _draw(index: I32, begin: int, end: int, state: np.uint64) -> int:
+    """One of index[begin:end] at random, overwritten by the last of them: what is left is index[begin : end - 1]."""
+    j = begin + _below(state, end - begin)
+    flat: int = index[j]
+    index[j] = index[end - 1]
+    return flat
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -359,6 +372,7 @@ def _plane_rms_px(age: F64, reject_px: float, rejections: int, min_neighbours: i
 
 @njit(cache=True, nogil=True)
 def _obeys_paper(age: F64, min_neighbours: int, spread_s: float) -> bool:
+    """Sec. V-A, rules 2 and 3: enough neighbours, and the event within ``spread_s`` of their mean time."""
     n = 0
     total = 0.0
     for j in range(SIZE):

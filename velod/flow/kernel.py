@@ -7,7 +7,17 @@ import math
 import numpy as np
 from numba import njit
 
-from velod.events.plane_fit import INNER_AT, RING_AT, SIZE, WIDE_SIZE, fit_plane, honest_rms, rms_px, widen_plane
+from velod.events.plane_fit import (
+    INNER_AT,
+    RING_AT,
+    SIZE,
+    WIDE_SIZE,
+    PlaneFit,
+    fit_plane,
+    honest_rms,
+    rms_px,
+    widen_plane,
+)
 from velod.geometry.cholesky import backward, factorise, forward
 from velod.types import F32, F64, I64, RING, U16, U32
 
@@ -70,7 +80,7 @@ def fit_flows(
             for j in range(RING):
                 wide[RING_AT[j]] = ring[i, j] * 1e-9
             fit, bend, slope_rms = widen_plane(fit, wide, reject_px, max_rms_px, time_noise_s)
-        n, gx, gy, _, rms, qxx, qxy, qyy = fit
+        _, gx, gy, _, rms, _, _, _ = fit
         slope = math.sqrt(gx * gx + gy * gy)
         if not rms_px(rms, slope * slope, time_noise_s) < max_rms_px:
             refused[_RMS] += 1
@@ -90,13 +100,7 @@ def fit_flows(
             continue
         # Eq. 6: the normal flow is grad_T / |grad_T|^2.
         nx, ny, speed = tx / grad_T, ty / grad_T, 1.0 / grad_T
-        # Variances of the slope along n and across it, as shares of the slope: errors of speed and of direction.
-        sigma_t = INFLATION * honest_rms(n, slope_rms, slope, time_noise_s)
-        along = math.hypot(
-            speed * sigma_t * _deviation(qxx, qxy, qyy, a * nx + d * ny, b * nx + e * ny),
-            BEND_PX * bend / slope,
-        )
-        across = speed * sigma_t * _deviation(qxx, qxy, qyy, d * nx - a * ny, e * nx - b * ny)
+        along, turn[m] = _shares(fit, slope, bend, slope_rms, time_noise_s, a, b, d, e, nx, ny, speed)
         if benosman:
             # Per-component reciprocal (Benosman 2014), the baseline of Table II.
             bx = 1.0 / tx if tx != 0.0 else 0.0
@@ -110,11 +114,38 @@ def fit_flows(
         flow[m, 3] = ny
         flow[m, 4] = speed
         flow[m, 5] = along * speed
-        turn[m] = across
         m += 1
     if m > 0:
         _let_in_motion_along_edges(flow[:m], turn[:m])
     return m
+
+
+@njit(cache=True, nogil=True)
+def _shares(
+    fit: PlaneFit,
+    slope: float,
+    bend: float,
+    slope_rms: float,
+    time_noise_s: float,
+    a: float,
+    b: float,
+    d: float,
+    e: float,
+    nx: float,
+    ny: float,
+    speed: float,
+) -> tuple[float, float]:
+    """Standard deviations of the slope along n and across it, as shares of it: errors of speed and direction (rad).
+
+    ((a, b), (d, e)) takes the sensor's gradients to the rectified image, where n and ``speed`` are.
+    """
+    n, _, _, _, _, qxx, qxy, qyy = fit
+    sigma_t = INFLATION * honest_rms(n, slope_rms, slope, time_noise_s)
+    along = math.hypot(
+        speed * sigma_t * _deviation(qxx, qxy, qyy, a * nx + d * ny, b * nx + e * ny),
+        BEND_PX * bend / slope,
+    )
+    return along, speed * sigma_t * _deviation(qxx, qxy, qyy, d * nx - a * ny, e * nx - b * ny)
 
 
 @njit(cache=True, nogil=True)
