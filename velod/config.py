@@ -31,12 +31,16 @@ def _f(
 
 @dataclass(frozen=True, slots=True)
 class RigSettings:
+    """Which rig."""
+
     name: str = _f("rig0", "name of the rig; the second part of every key, velod/<rig>/...")
     calibration: str = _f("", "calibration file (YAML), relative to the current directory; empty: the recording's")
 
 
 @dataclass(frozen=True, slots=True)
 class IngestSettings:
+    """What ingest makes of the sensors' streams: batches, selection, and what it leaves out under load."""
+
     mode: str = _f(
         "batch",
         "selection: 'batch' by batch, or 'event' by event, each as soon as its neighbourhood is complete",
@@ -129,6 +133,8 @@ class IngestSettings:
 
 @dataclass(frozen=True, slots=True)
 class FlowSettings:
+    """The flow workers, and which plane fits give a flow."""
+
     workers: int = _f(1, "processes", lo=1, hi=64)
     reject_px: float = _f(
         1.0,
@@ -149,6 +155,8 @@ class FlowSettings:
 
 @dataclass(frozen=True, slots=True)
 class DepthSettings:
+    """The depth workers: matching, refinement and the checks of a match."""
+
     workers: int = _f(1, "processes", lo=1, hi=64)
     tau_ms: float = _f(10.0, "decay of the time surfaces of block matching, ms", above=0.0, hi=1000.0)
     block_px: int = _f(17, "side of the matching block, odd", lo=5, hi=41)
@@ -182,6 +190,8 @@ class DepthSettings:
 
 @dataclass(frozen=True, slots=True)
 class OptimizerSettings:
+    """The optimizers: spline, window, weights, output, and from when on the calibration is doubted."""
+
     workers: int = _f(1, "processes: one leads, the others stand by to take over within 0.1 s", lo=1, hi=8)
     output_hz: float = _f(75.0, "velocities per second of sensor time", lo=1.0, hi=1000.0)
     frame: str = _f(
@@ -256,6 +266,8 @@ class OptimizerSettings:
 
 @dataclass(frozen=True, slots=True)
 class ImuSettings:
+    """What is known of the IMU: noise densities of continuous time, biases, gravity."""
+
     accel_noise: float = _f(1.86e-2, "accelerometer white noise density, m/s^2/sqrt(Hz)", above=0.0, hi=10.0)
     gyro_noise: float = _f(1.86e-3, "gyroscope white noise density, rad/s/sqrt(Hz)", above=0.0, hi=1.0)
     accel_bias_walk: float = _f(4.33e-3, "accelerometer bias random walk, m/s^2/sqrt(s)", above=0.0, hi=1.0)
@@ -267,6 +279,8 @@ class ImuSettings:
 
 @dataclass(frozen=True, slots=True)
 class ZenohSettings:
+    """How the processes find each other, and who else may."""
+
     port: int = _f(17447, "the introducer's port on loopback", lo=1, hi=65535)
     connect: str = _f("", "endpoint of another host's velod, tls/host:port; empty: this host is the introducer")
     listen: str = _f("", "further endpoint on which other hosts may connect, tls/address:port; empty: loopback only")
@@ -284,6 +298,8 @@ class ZenohSettings:
 
 @dataclass(frozen=True, slots=True)
 class Settings:
+    """All of them, by section of the TOML file."""
+
     rig: RigSettings = field(default_factory=RigSettings)
     ingest: IngestSettings = field(default_factory=IngestSettings)
     flow: FlowSettings = field(default_factory=FlowSettings)

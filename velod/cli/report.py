@@ -133,6 +133,7 @@ class VelocityLine:
         self._times_s: deque[float] = deque(maxlen=75)
 
     def show(self, v: Velocity, latency_ms: float) -> None:
+        """Note a velocity, and draw it if it is time to."""
         self._times_s.append(time.monotonic())
         if self.line.due():
             self.line.draw(describe_velocity(v, self._rate_hz(), latency_ms))

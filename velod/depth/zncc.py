@@ -38,6 +38,7 @@ class Surface:
 
     @staticmethod
     def of(values: F32) -> Surface:
+        """From a time surface (h, w), 0..1, which is copied."""
         flat = np.zeros(values.size + CHUNK, np.float32)
         same = flat[: values.size].reshape(values.shape)
         same[:] = values

@@ -40,10 +40,12 @@ class FrontEnd:
 
     @property
     def flows(self) -> list[FlowBatch]:
+        """In the order in which they came."""
         return [m for m in self.messages if isinstance(m, FlowBatch)]
 
     @property
     def depths(self) -> list[DepthBatch]:
+        """In the order in which they came."""
         return [m for m in self.messages if isinstance(m, DepthBatch)]
 
     def batches(self) -> Iterator[tuple[FlowBatch, DepthBatch]]:

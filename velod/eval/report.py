@@ -96,6 +96,7 @@ class Report:
         self._sections: list[Section] = []
 
     def add(self, section: Section) -> None:
+        """Put a section behind the others."""
         self._sections.append(section)
 
     def finish(self, tables: Mapping[str, Table], notes: Sequence[str]) -> Path:

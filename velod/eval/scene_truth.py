@@ -66,6 +66,7 @@ class DepthImages:
         self._R_WL, self._p_WL = self._poses(depth.t_ns, rectification.R_rect_left.T @ rectification.R_CB)
 
     def __call__(self, t_ns: I64, rays: F64, shift_m: float = 0.0) -> F64:
+        """As TrueDepth says: by the image nearest in time, or by the next where that one does not tell."""
         R_WC, p_WC = self._poses(t_ns, self._rectification.R_CB)
         p_WC = p_WC + shift_m * R_WC[:, :, 0]
         order = np.argsort(np.abs(t_ns[:, None] - self._depth.t_ns), axis=1, kind="stable")[:, :2]

@@ -59,12 +59,15 @@ class Row:
     stages: StageErrors | None = None  # of velod's front end, where the truth of it is known
 
     def ave(self, method: str) -> Spread:
+        """AVE over the runs of a method, m/s."""
         return spread(j.metrics.ave_mps for j in self.judgement.get(method, ()))
 
     def rve(self, method: str) -> Spread:
+        """RVE (Eq. 16) over the runs of a method, %."""
         return spread(j.metrics.rve_percent for j in self.judgement.get(method, ()))
 
     def drift(self, method: str) -> Spread:
+        """Drift of the dead reckoning over the runs of a method, % of the distance."""
         return spread(j.track.drift_percent for j in self.judgement.get(method, ()) if j.track is not None)
 
     def marked(self, method: str) -> str:

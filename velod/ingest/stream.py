@@ -54,6 +54,7 @@ class EventQueue:
         return self._x[room], self._y[room], self._t_ns[room], self._p[room]
 
     def commit(self, n: int) -> None:
+        """The first ``n`` places of ``reserve`` hold events now."""
         self._tail += n
 
     def peek(self) -> tuple[U16, U16, I64, U8]:

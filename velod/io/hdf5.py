@@ -127,6 +127,7 @@ class Hdf5Events:
 
     @staticmethod
     def open(file: Any, path: Path, group: str, offset_us: int = 0) -> Hdf5Events:
+        """Columns x, y, t, p of ``group``; ``offset_us`` is added to t, both in us. Raises RecordingError."""
         columns = {c: dataset(file, f"{group}/{c}", path) for c in "xytp"}
         for c, column in columns.items():
             if column.dtype.kind not in "iub":
@@ -137,6 +138,7 @@ class Hdf5Events:
         return Hdf5Events(f"{path}:/{group}", n, first, last, path, group, offset_us)
 
     def blocks(self) -> Iterator[EventColumns]:
+        """Consecutive blocks in file order. Raises RecordingError."""
         with opened(self.path) as file:
             x, y, t, p = (file[f"{self.group}/{c}"] for c in "xytp")
             for start in range(0, self.n_events, BLOCK):

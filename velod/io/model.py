@@ -78,7 +78,9 @@ class EventSource(Protocol):
         ...
 
     @property
-    def n_events(self) -> int: ...
+    def n_events(self) -> int:
+        """How many there are."""
+        ...
 
     @property
     def first_t_ns(self) -> int:

@@ -41,6 +41,7 @@ class Recording:
 
     @property
     def duration_s(self) -> float:
+        """From its start to its end in sensor time, s."""
         return (self.t_end_ns - self.t_start_ns) / NS_PER_S
 
     @property

@@ -81,6 +81,7 @@ class TextEvents:
         return TextEvents(str(path), n, int(first_t_ns), int(last_t_ns), path)
 
     def blocks(self) -> Iterator[EventColumns]:
+        """Consecutive blocks in file order. Raises RecordingError."""
         rest = _lines(self.path)
         while lines := list(islice(rest, BLOCK)):
             table = _table(lines, 4, self.path)

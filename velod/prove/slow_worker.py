@@ -37,6 +37,7 @@ class Slow:
 
 
 def main() -> None:
+    """A flow worker that sleeps on each batch: arguments ENDPOINT NAME MS."""
     endpoint, name, ms = sys.argv[1:]
     worker.start_logging(name)
     worker.prepare_process(0)

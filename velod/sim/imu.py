@@ -31,6 +31,7 @@ class ImuModel:
             raise SensorError(f"the IMU's rate must divide 1,000,000 Hz, got {self.rate_hz}")
 
     def noiseless(self) -> ImuModel:
+        """The same rate without noise and without walking biases."""
         return ImuModel(self.rate_hz, 0.0, 0.0, 0.0, 0.0)
 
 

@@ -16,10 +16,12 @@ _SAME_W = 1e-9
 
 
 def constant(value: float) -> Waves:
+    """``value`` at all times."""
     return ((value, 0.0, 0.5 * math.pi),)
 
 
 def scaled(factor: float, waves: Waves) -> Waves:
+    """``factor`` times the sum."""
     return tuple((factor * a, w, phase) for a, w, phase in waves)
 
 
