@@ -17,8 +17,8 @@ ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 COMMANDS = re.findall(r"^    (\w+) +\w", parser().format_help(), re.M)
 FENCE = re.compile(r"^ *```(\w*)\n(.*?)^ *```", re.M | re.S)
-# What the settings' sections hold; names of benchmarks and of health's gauges look alike.
-SETTING = re.compile(r"(?:rig|ingest|flow|depth|optimizer|zenoh)\.(?!event_by_event|kernel)\w+")
+# What the settings' sections hold; names of benchmarks, and of modules, look alike.
+SETTING = re.compile(r"(?:rig|ingest|flow|depth|optimizer|zenoh)\.(?!event_by_event|kernel|shm)\w+")
 
 each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 
