@@ -233,11 +233,14 @@ def main(wanted: Sequence[str]) -> int:
     if reason := why_not():
         print(f"no table: {reason}", file=sys.stderr)
         return 1
+    chosen = [fault for fault in FAULTS if not wanted or any(part in fault.name for part in wanted)]
+    if not chosen:
+        print(f"no fault of that name; faults: {'; '.join(fault.name for fault in FAULTS)}", file=sys.stderr)
+        return 2
     print(HEADER, flush=True)
-    for fault in FAULTS:
-        if not wanted or any(part in fault.name for part in wanted):
-            with tempfile.TemporaryDirectory() as directory:
-                print(row(fault.name, *run(fault, Path(directory))), flush=True)
+    for fault in chosen:
+        with tempfile.TemporaryDirectory() as directory:
+            print(row(fault.name, *run(fault, Path(directory))), flush=True)
     return 0
 
 

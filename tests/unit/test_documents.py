@@ -104,6 +104,14 @@ def test_every_file_of_the_project_that_a_page_names_is_there(page: Path) -> Non
 
 
 @each_page
+def test_every_test_that_a_page_picks_out_by_name_is_in_the_file_that_it_names(page: Path) -> None:
+    for code in mentions(page):
+        if picked := re.search(r"^pytest .*-k (\w+)", code):
+            files = [ROOT / word for word in code.split() if word.startswith("tests/")]
+            assert any(picked[1] in file.read_text("utf-8") for file in files), code
+
+
+@each_page
 def test_every_link_within_the_project_leads_somewhere(page: Path) -> None:
     for target in re.findall(r"\]\((?!http)([^)]+)\)", page.read_text("utf-8")):
         path, _, anchor = target.partition("#")
