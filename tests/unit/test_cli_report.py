@@ -9,7 +9,7 @@ import time
 import numpy as np
 import pytest
 
-from velod.cli.play import Played, shortcomings
+from velod.cli.played import Played, shortcomings
 from velod.cli.report import Line, describe_velocity, progress_bar, speed_and_sigma
 from velod.cli.watch import Place, describe, losses, table
 from velod.client import Received
