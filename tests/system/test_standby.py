@@ -53,7 +53,8 @@ def test_whatever_happens_to_the_leader_consumers_see_one_stream(rig: Rig) -> No
         kill_one_and_stop_the_other(rig)
     seen = rig.seen(consumer)
     steps_ns = np.diff([row["sensor_t_ns"] for row in seen.used])
-    assert 13_000_000 < steps_ns.min() <= steps_ns.max() < 14_000_000
+    odd = [(seen.used[i : i + 2], seen.counters) for i in np.flatnonzero(abs(steps_ns - 13_500_000) >= 500_000)]
+    assert odd == [], "each tick once, in order"
     assert (np.diff([row["seq"] for row in seen.used]) == 1).all()
     assert all(row["valid"] for row in seen.used[75:])
     # Both the one that is late and the one that takes over may have waited for a busy machine.
