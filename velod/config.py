@@ -240,6 +240,7 @@ class OptimizerSettings:
         hi=1e3,
     )
     correct_imu_clock: bool = _f(True, "a delay of the events against the IMU is taken out of their stamps")
+    widen_bias_prior: bool = _f(True, "biases that the data make likely widen their prior beyond imu.*_bias_sigma")
     zero_velocity: bool = _f(True, "rest is observed as zero velocity: no moving events and a quiet IMU")
     ransac_iterations: int = _f(64, "minimal samples of the linear solver (Eq. 15)", lo=8, hi=10_000)
     min_flows: int = _f(12, "flows with a depth that a batch must have", lo=6, hi=10_000)

@@ -253,6 +253,14 @@ def test_biases_beyond_their_specification_are_in_the_covariance_from_the_first_
     assert np.concatenate(squared).mean() < 4.0
 
 
+def test_the_prior_of_the_biases_stays_as_specified_where_that_is_asked_for():
+    b_a, b_w = np.full(3, 0.3), np.full(3, 0.03)
+    for widen in (True, False):
+        stream = with_imu(messages(FLIGHT, 0.6), lambda t, a, w: (a + b_a, w + b_w))
+        _, stage = run(stream, widen_bias_prior=widen)
+        assert bool(stage._estimator.counters.get("bias.prior_changed")) == widen
+
+
 def test_an_accelerometer_in_g_gives_no_velocity():
     """What is taken for its bias cannot be one: not valid, and why, a quarter of a second after the start."""
     for motion in (FLIGHT, STEADY):

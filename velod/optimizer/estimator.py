@@ -171,7 +171,7 @@ class Estimator:
     def _widen_bias_prior(self) -> None:
         """As wide as the biases make likely that are found, while their prior is in the window."""
         head = self.head
-        if head is None or not self.window.holds_start:
+        if head is None or not self._o.widen_bias_prior or not self.window.holds_start:
             return
         imu, seconds = self._imu, (head.t_ns - self._started_ns) * 1e-9
         sigma = np.repeat([imu.accel_bias_sigma, imu.gyro_bias_sigma], 3)
