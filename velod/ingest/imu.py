@@ -11,6 +11,7 @@ from velod.alarms import Alarms
 from velod.config import IngestSettings
 from velod.events.columns import readonly
 from velod.events.sae import NEVER
+from velod.ingest.drops import count_drops
 from velod.ingest.imu_units import ImuUnits
 from velod.ingest.ordering import PacketOrder
 from velod.types import F64, I64, NS_PER_S, ImuPacket
@@ -54,9 +55,7 @@ class ImuStream:
             readonly(packet.gyro, np.float64),
             self._max_frozen, self._last_ns, self._identical, self._last_value, kept, dropped,
         )  # fmt: skip
-        for cause, count in zip(DROPS, dropped.tolist(), strict=True):
-            if count:
-                self._counters[cause] += count
+        count_drops(self._counters, DROPS, dropped)
         good = kept[:n]
         t_ns, accel, gyro = packet.sample_t_ns[good] - self._offset_ns, packet.accel[good], packet.gyro[good]
         if n:

@@ -12,6 +12,7 @@ from velod.config import IngestSettings
 from velod.events.columns import readonly
 from velod.events.sae import NEVER, new_surface, update_sae
 from velod.ingest.budget import BAND_ROWS
+from velod.ingest.drops import count_drops
 from velod.ingest.ordering import PacketOrder
 from velod.types import I64, NS_PER_S, U8, U16, EventPacket
 
@@ -110,9 +111,7 @@ class CameraStream:
         self.queue.commit(kept)
         self._bound_queue()
         self.watermark_ns = max(self.watermark_ns, packet.t_ns)
-        for cause, count in zip(DROPS, dropped.tolist(), strict=True):
-            if count:
-                self._counters[cause] += count
+        count_drops(self._counters, DROPS, dropped)
 
     def _bound_queue(self) -> None:
         """Drop the oldest events where times do not go on and so no batch ends."""

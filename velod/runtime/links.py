@@ -22,6 +22,8 @@ from typing import Final
 
 import zenoh
 
+from velod.runtime.callbacks import direct
+
 log = logging.getLogger("velod")
 
 RETRANSMIT_MIN_US: Final = 20_000
@@ -58,7 +60,7 @@ def follow(session: zenoh.Session, changed: Callable[[zenoh.LinkEvent], None], *
     def note(event: zenoh.LinkEvent) -> None:
         _to_do.put((changed, event))
 
-    session.info.declare_link_events_listener(zenoh.handlers.Callback(note, indirect=False), history=history)
+    session.info.declare_link_events_listener(direct(note), history=history)
 
 
 _to_do: SimpleQueue[tuple[Callable[[zenoh.LinkEvent], None], zenoh.LinkEvent]] = SimpleQueue()

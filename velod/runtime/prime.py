@@ -17,6 +17,7 @@ from typing import Any
 import zenoh
 
 from velod.runtime import pools
+from velod.runtime.callbacks import direct
 from velod.runtime.outlet import Outlet
 from velod.wire.topics import PRIME, key
 
@@ -33,7 +34,7 @@ def listen(session: zenoh.Session, rig: str) -> Any:
     def ignore(sample: zenoh.Sample) -> None:
         del sample
 
-    return session.declare_subscriber(key(PRIME, rig), zenoh.handlers.Callback(ignore, indirect=False))
+    return session.declare_subscriber(key(PRIME, rig), direct(ignore))
 
 
 @contextmanager

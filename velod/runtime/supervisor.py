@@ -20,6 +20,7 @@ import zenoh
 
 from velod.config import Settings
 from velod.geometry.calibration import Calibration
+from velod.runtime.callbacks import direct
 from velod.runtime.health import HealthReporter
 from velod.runtime.outlet import Outlet
 from velod.runtime.pools import PoolKeeper
@@ -215,7 +216,7 @@ class Supervisor(Stacked):
                 change((token["stage"], token["worker"]))
 
         watch = self.session.liveliness().declare_subscriber(
-            key(ALIVE, self._settings.rig.name), zenoh.handlers.Callback(changed, indirect=False), history=True
+            key(ALIVE, self._settings.rig.name), direct(changed), history=True
         )
         stack.enter_context(watch)
 
