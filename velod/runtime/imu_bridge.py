@@ -111,7 +111,7 @@ class ImuBridge:
             assert isinstance(packet, ImuPacket)
             return self._stream.take(packet)
         except WireError as e:
-            self.counters[e.reason] += 1
+            self.counters[f"bridge.{e.reason}"] += 1  # an ingest that lives has counted it as its own
         except ClockRestart:
             self._packets.clear()  # ingest will say so
         return []
