@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -11,7 +13,10 @@ from velod.ingest.stage import IngestStage
 from velod.runtime.budget import (
     EVENT_GRACE_S,
     GRACE_S,
+    HURRIED_S,
     LEAST_SELECTION,
+    LONGER_FOR_S,
+    LONGER_NS,
     MAX_WAITING,
     NO_PACKET,
     STANDING_S,
@@ -21,6 +26,8 @@ from velod.runtime.budget import (
 from velod.types import ImuSamples, StereoBatch
 
 TARGET_S = 0.05
+LONGER = Budget(room=MAX_WAITING, shortest_ns=LONGER_NS)
+"""Everything is taken on, in no more batches than outputs."""
 
 
 def run(load: LoadShedder, delay_s: float, start_s: float, seconds: float) -> float:
@@ -33,9 +40,21 @@ def run(load: LoadShedder, delay_s: float, start_s: float, seconds: float) -> fl
 
 def test_without_delay_everything_is_taken_on() -> None:
     load = LoadShedder(TARGET_S)
-    now_s = run(load, 0.4 * TARGET_S, 0.0, 1.0)
+    now_s = run(load, 0.9 * HURRIED_S, 0.0, 1.0)
     assert load.takes_packet(0.4 * TARGET_S, now_s)
     assert load.budget() == Budget(room=MAX_WAITING)
+
+
+def test_a_batch_that_takes_too_long_makes_batches_longer_at_once_and_for_a_while() -> None:
+    load = LoadShedder(TARGET_S)
+    load.note_workers(1.1 * HURRIED_S, 0, 0.0)
+    assert load.budget() == LONGER
+    assert load.gauges()["batch.shortest_ms"] == 1e-6 * LONGER_NS
+    load.note_workers(0.0, 0, 0.99 * LONGER_FOR_S)
+    assert load.budget() == LONGER
+    load.note_workers(0.0, 0, 1.01 * LONGER_FOR_S)
+    assert load.budget() == Budget(room=MAX_WAITING)
+    assert load.gauges()["batch.shortest_ms"] == 0.0
 
 
 def test_late_workers_get_fewer_events_then_no_batches_and_all_again_when_they_are_not() -> None:
@@ -51,19 +70,19 @@ def test_late_workers_get_fewer_events_then_no_batches_and_all_again_when_they_a
     now_s = run(load, 0.0, now_s, 1.0)
     assert 0.5 < load.budget().selection < 0.7
     run(load, 0.0, now_s, 1.0)
-    assert load.budget() == Budget(room=MAX_WAITING)
+    assert load.budget() == LONGER
 
 
 def test_a_queue_that_stands_is_drained_by_fewer_events_but_half_of_them_stay() -> None:
     load = LoadShedder(10.0 * STANDING_S)
     now_s = run(load, 1.2 * STANDING_S, 0.0, GRACE_S)
-    assert load.budget() == Budget(room=MAX_WAITING), "a moment's queue is none that stands"
+    assert load.budget() == LONGER, "a moment's queue is none that stands"
     now_s = run(load, 1.2 * STANDING_S, now_s, 0.5)
     assert STANDING_SELECTION < load.budget().selection < 0.9
     now_s = run(load, 9.0 * STANDING_S, now_s, 3.0)
-    assert load.budget() == Budget(selection=STANDING_SELECTION, room=MAX_WAITING)
+    assert load.budget() == replace(LONGER, selection=STANDING_SELECTION)
     run(load, 0.4 * STANDING_S, now_s, 1.1)
-    assert load.budget() == Budget(room=MAX_WAITING)
+    assert load.budget() == LONGER
 
 
 def test_a_queue_that_is_short_now_and_then_does_not_stand() -> None:
@@ -72,7 +91,7 @@ def test_a_queue_that_is_short_now_and_then_does_not_stand() -> None:
     for _ in range(10):
         now_s = run(load, 3.0 * STANDING_S, now_s, 0.8 * GRACE_S)
         now_s = run(load, 0.9 * STANDING_S, now_s, 0.01)
-    assert load.budget() == Budget(room=MAX_WAITING)
+    assert load.budget() == LONGER
 
 
 def test_an_ingest_that_is_late_makes_fewer_batches_then_looks_at_fewer_rows() -> None:
@@ -132,12 +151,13 @@ def test_health_tells_the_share_of_the_period_and_raises_an_alarm_while_it_is_sm
     load.note_batch()
     load.end_period({"shed.batches": 1})
     share = load.budget().selection
-    assert load.shares() == {"share.selection": share / 2, "share.events": 1.0}
+    gauges = load.gauges()
+    assert (gauges["share.selection"], gauges["share.events"]) == (share / 2, 1.0)
     assert f"{share / 2:.0%} of the quota" in load.alarms()["load.selection"]
     run(load, 0.0, 1.0, 2.0)
     load.note_batch()
     load.end_period({"shed.batches": 1})
-    assert load.shares()["share.selection"] == 1.0
+    assert load.gauges()["share.selection"] == 1.0
     assert load.alarms() == {}
 
 
@@ -146,6 +166,7 @@ def test_a_target_of_zero_sheds_nothing() -> None:
     load.note_workers(100.0, 1000, 0.0)
     assert load.takes_packet(100.0, 0.0)
     assert load.budget() == Budget()
+    assert load.gauges()["batch.shortest_ms"] == 0.0
 
 
 # --- the stage keeps to it
@@ -176,6 +197,17 @@ def test_batches_beyond_the_budget_have_no_number_and_the_optimizer_is_told_to_g
     assert ingest.counters["shed.batches"] == len(everything) - 2
     last = [m for m in out if isinstance(m, ImuSamples)][-1]
     assert (last.batch_seq, last.batch_t_ns, last.event_t_ns) == (1, everything[1].t_ns, everything[-1].t_ns)
+
+
+def test_no_batch_ends_by_its_count_sooner_than_the_budget_allows_but_its_period_stands() -> None:
+    """The edges here reach the count of 500 events in 3 to 4 ms; the period is 10 ms."""
+    natural, longer, period = (
+        np.diff([b.t_ns for b in event_batches(handled(Budget(shortest_ns=ns))[1])])
+        for ns in (0, 6_000_000, 50_000_000)
+    )
+    assert len(natural) > 20 and natural.max() < 6_000_000
+    assert set(longer) == {6_000_000}
+    assert set(period) == {10_000_000}
 
 
 def test_a_share_of_the_batches_is_spread_evenly() -> None:

@@ -23,6 +23,7 @@ class Budget:
     batches: float = 1.0  # share of the batches that are made, evenly spread
     room: int = sys.maxsize  # so many more may be made; those beyond are not
     slices: bool = True  # event by event: what is selected may go out before its batch ends
+    shortest_ns: int = 0  # sensor time; however many events there are, no batch is shorter
 
     def quota(self, full: int) -> int:
         """Events that a batch may select, at least 1."""

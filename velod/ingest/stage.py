@@ -152,7 +152,7 @@ class IngestStage:
         out: list[Output] = []
         while True:
             left, right, batch = self._left, self._right, self._open
-            batch.find_end(left.queue.peek()[2], left.watermark_ns)
+            batch.find_end(left.queue.peek()[2], left.watermark_ns, self.budget.shortest_ns)
             horizon = batch.horizon_ns(left.watermark_ns)
             out += self._enter_left(horizon)
             # Events of the right camera do not pile up while the left one is silent.

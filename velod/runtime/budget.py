@@ -1,8 +1,9 @@
 """Load shedding: what ingest may take on, from how late its workers and it itself are.
 
-Late means waiting: a batch that is not finished, a packet that has not been looked at. While something is later than
-a target, less is taken on: fewer events, then fewer batches or packets, never old ones. No input or output and no
-clock here; ``now_s`` is any clock that does not go backwards.
+Late means waiting: a batch that is not finished, a packet that has not been looked at. What is done first costs
+nearly nothing: batches are no more than outputs. While something is later than a target, less is taken on: fewer
+events, then fewer batches or packets, never old ones. No input or output and no clock here; ``now_s`` is any clock
+that does not go backwards.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from velod.ingest.budget import BAND_ROWS, LEAST_ROWS, Budget
+from velod.types import NS_PER_S
 
 FALL = 0.8
 """A share is multiplied by this while something is late, once in the time that is late."""
@@ -29,6 +31,12 @@ STANDING_S = 0.025
 """Where every batch has to wait for so long, for as long as the grace, a queue stands that nothing drains ..."""
 STANDING_SELECTION = 0.5
 """... and it costs latency alone: so much less is selected at the most until it is gone."""
+HURRIED_S = 0.01
+"""A batch that is not finished after so long (a worker takes half of that) shows that cores are short ..."""
+LONGER_NS = NS_PER_S // 75
+"""... and batches are no shorter than this, as more batches than outputs make no output newer ..."""
+LONGER_FOR_S = 10.0
+"""... until there has been no such batch for so long."""
 LEAST_BATCHES = 0.1
 NO_BATCH = 2.0
 """While a batch is later than this many targets, no further one is made."""
@@ -90,6 +98,8 @@ class LoadShedder:
     _batches: Share = field(init=False)
     _rows: Share = field(init=False)
     _room: int = MAX_WAITING
+    _shortest_ns: int = 0
+    _hurried_s: float = -math.inf  # when a batch last took too long
     _cuts: bool = True
     _dropping: bool = False
     _shed: int = 0  # batches, when the last period ended
@@ -115,6 +125,9 @@ class LoadShedder:
 
     def note_workers(self, delay_s: float, waiting: int, now_s: float) -> None:
         """What a new batch has to wait for has been there for ``delay_s``; ``waiting`` batches have not been sent."""
+        if self.target_s and delay_s > HURRIED_S:
+            self._hurried_s = now_s
+        self._shortest_ns = LONGER_NS if now_s < self._hurried_s + LONGER_FOR_S else 0
         self._selection.note(delay_s, now_s)
         self._room = 0 if delay_s > NO_BATCH * self.target_s else max(0, MAX_WAITING - waiting)
 
@@ -140,7 +153,7 @@ class LoadShedder:
         """What may be taken on now."""
         if not self.target_s:
             return Budget()
-        return Budget(self._share, self._rows.value, self._batches.value, self._room, self._cuts)
+        return Budget(self._share, self._rows.value, self._batches.value, self._room, self._cuts, self._shortest_ns)
 
     @property
     def _share(self) -> float:
@@ -152,7 +165,7 @@ class LoadShedder:
         self._selected += self._share if self.target_s else 1.0
 
     def end_period(self, counters: Mapping[str, int]) -> None:
-        """A period of health ends, with these counters of ingest; ``shares`` and ``alarms`` now speak of it."""
+        """A period of health ends, with these counters of ingest; ``gauges`` and ``alarms`` now speak of it."""
         shed = counters.get("shed.batches", 0)
         batches, self._shed = self._made + shed - self._shed, shed
         self._used = (
@@ -161,9 +174,15 @@ class LoadShedder:
         )
         self._made, self._selected, self._packets, self._looked_at = 0, 0.0, 0, 0.0
 
-    def shares(self) -> dict[str, float]:
-        """Shares of the period: of the selection (batches that were not made count 0), and of the events."""
-        return {"share.selection": self._used[0], "share.events": self._used[1]}
+    def gauges(self) -> dict[str, float]:
+        """Shares of the period: of the selection (batches that were not made count 0), and of the events; and how
+        short batches may be now.
+        """
+        return {
+            "share.selection": self._used[0],
+            "share.events": self._used[1],
+            "batch.shortest_ms": 1e-6 * self._shortest_ns,
+        }
 
     def alarms(self) -> dict[str, str]:
         """What was shed in the period."""

@@ -143,8 +143,8 @@ class IngestShell(WorkerShell):
         return {**super().alarms(), **self._dispatch.alarms(), **self._load.alarms()}
 
     def gauges(self) -> dict[str, float]:
-        """With the shares of the load that were taken on, and the sensor's clock."""
-        return {**super().gauges(), **self._load.shares(), **self._sensor_clock.gauges()}
+        """With what was taken on of the load, and the sensor's clock."""
+        return {**super().gauges(), **self._load.gauges(), **self._sensor_clock.gauges()}
 
 
 class BatchShell(WorkerShell):
