@@ -27,7 +27,7 @@ from velod.runtime.session import SessionError, open_session
 from velod.runtime.stacked import Stacked
 from velod.types import Velocity
 from velod.wire import Envelope, WireError, decode
-from velod.wire.topics import ALIVE, ANY_RIG, DEPTH, DONE, FLOW, VELOCITY, Topic, key, parts
+from velod.wire.topics import ALIVE, ANY_RIG, DEPTH, DONE, FLOW, VELOCITY, VELOCITY_AGAIN, Topic, key, parts
 
 LOCAL = "tcp/127.0.0.1:17447"
 """Where a velod with default settings is found from its own host."""
@@ -136,8 +136,9 @@ class Listener(Stacked):
         except WireError as e:
             self._refused[e.reason] = self._refused.get(e.reason, 0) + 1
             return None
-        gaps = self._gaps.setdefault((topic.name, found), GapCounter(_OVERTAKING.get(topic.name, 0)))
-        gaps.see(envelope.message.seq)
+        if topic.rate_hz:  # of what is sent on demand no message follows from the one before
+            gaps = self._gaps.setdefault((topic.name, found), GapCounter(_OVERTAKING.get(topic.name, 0)))
+            gaps.see(envelope.message.seq)
         return Received(topic, found, envelope, t_ns, len(data))
 
     @property
@@ -159,14 +160,14 @@ class VelocityClient(Stacked):
     """The stream of velocities of one rig, or of all (``"*"``): ``rig`` then says whose velocity was the last one.
 
     A context manager and an endless iterable of valid velocities (``valid_only=False``: of all), in order of sensor
-    time. Reconnects by itself. Velocities older than ``max_age_s`` when they are handed out are discarded and counted
-    as ``stale``, invalid ones as ``invalid``, and those of a time that was handed out already as ``repeated`` (a
-    stand-by that takes over may repeat one). Each has the age at which it is handed out, ``age_ms``: NaN where it
-    cannot be known, because the publisher's clock is not in step with this host's (counted as ``age.unknown``; such
-    are not stale, whatever they are). ``max_age_s = math.inf`` keeps everything, as for a replay in slow motion.
-    ``tls/`` endpoints need ``keys``, a folder with certificates; ``tcp/`` ones on other hosts have to be allowed with
-    ``insecure``. To enter it raises velod.runtime.session.SessionError: endpoint malformed, certificate of no use,
-    TLS refused.
+    time. Reconnects by itself. Velocities older than ``max_age_s`` when they are handed out are discarded and
+    counted as ``stale``, invalid ones as ``invalid``, and those of a time that was handed out already as
+    ``repeated``. What a stand-by that takes over sends again, beside, fills the gap that its predecessor may have
+    left. Each has the age at which it is handed out, ``age_ms``: NaN where it cannot be known, because the
+    publisher's clock is not in step with this host's (counted as ``age.unknown``; such are not stale, whatever they
+    are). ``max_age_s = math.inf`` keeps everything, as for a replay in slow motion. ``tls/`` endpoints need
+    ``keys``, a folder with certificates; ``tcp/`` ones on other hosts have to be allowed with ``insecure``. To
+    enter it raises velod.runtime.session.SessionError: endpoint malformed, certificate of no use, TLS refused.
     """
 
     def __init__(
@@ -181,13 +182,13 @@ class VelocityClient(Stacked):
         insecure: bool = False,
     ) -> None:
         settings = ZenohSettings(connect=connect, keys=keys, role=role, insecure=insecure)
-        self._listener = Listener(rig, (VELOCITY,), settings)
+        self._listener = Listener(rig, (VELOCITY, VELOCITY_AGAIN), settings)
         self.rig = rig
         self._max_age_s = max_age_s
         self._valid_only = valid_only
         self._counted: dict[str, int] = {}
-        self._t_ns: dict[str, int] = {}  # by key: sensor time of the newest one handed out
-        self._clocks: dict[str, HostClocks] = {}  # by key
+        self._t_ns: dict[str, int] = {}  # by rig: sensor time of the newest one handed out
+        self._clocks: dict[str, HostClocks] = {}  # by rig
 
     def _open(self, stack: ExitStack) -> None:
         stack.enter_context(self._listener)
@@ -203,26 +204,32 @@ class VelocityClient(Stacked):
             velocity = received.envelope.message
             if not isinstance(velocity, Velocity):
                 continue
-            way_ms = self._way_ms(received)
-            newest_t_ns = self._t_ns.get(received.key, -CLOCK_RESTART_NS)
-            # A publisher that does not know the age of what it sends leaves the way to be judged alone.
-            if np.nansum([velocity.age_ms, way_ms]) > 1e3 * self._max_age_s:
-                self._count("stale")
-            elif newest_t_ns - CLOCK_RESTART_NS < velocity.t_ns <= newest_t_ns:
-                self._count("repeated")
-            elif self._valid_only and not velocity.valid:
-                self._count("invalid")
-            else:
-                self._t_ns[received.key] = velocity.t_ns
-                self.rig = parts(VELOCITY, received.key)["rig"]
-                if math.isnan(age_ms := velocity.age_ms + way_ms):
-                    self._count("age.unknown")
-                return replace(velocity, age_ms=age_ms)
+            rig = parts(received.topic, received.key)["rig"]
+            way_ms = self._way_ms(rig, received)
+            if why := self._why_not(rig, velocity, way_ms):
+                if received.topic is VELOCITY:  # nothing is lost of what was sent once more
+                    self._count(why)
+                continue
+            self._t_ns[rig] = velocity.t_ns
+            self.rig = rig
+            if math.isnan(age_ms := velocity.age_ms + way_ms):
+                self._count("age.unknown")
+            return replace(velocity, age_ms=age_ms)
         return None
 
-    def _way_ms(self, received: Received) -> float:
+    def _why_not(self, rig: str, velocity: Velocity, way_ms: float) -> str:
+        """Why a velocity is not handed out; empty where it is."""
+        newest_t_ns = self._t_ns.get(rig, -CLOCK_RESTART_NS)
+        # A publisher that does not know the age of what it sends leaves the way to be judged alone.
+        if np.nansum([velocity.age_ms, way_ms]) > 1e3 * self._max_age_s:
+            return "stale"
+        if newest_t_ns - CLOCK_RESTART_NS < velocity.t_ns <= newest_t_ns:
+            return "repeated"
+        return "invalid" if self._valid_only and not velocity.valid else ""
+
+    def _way_ms(self, rig: str, received: Received) -> float:
         """From publication to now, when it is handed out: it may have waited in the queue. NaN: not known."""
-        clocks = self._clocks.setdefault(received.key, HostClocks())
+        clocks = self._clocks.setdefault(rig, HostClocks())
         clocks.heard(received.envelope.t_pub_ns, received.t_received_ns)
         now_ns = time.time_ns()
         return (now_ns - received.envelope.t_pub_ns) * 1e-6 if clocks.agree(now_ns) else math.nan

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
@@ -16,13 +17,14 @@ import zenoh
 from velod.cli import watch
 from velod.cli.exit import EXIT_FAILED
 from velod.cli.watch import Way
+from velod.client import VelocityClient
 from velod.config import Settings
 from velod.runtime.outlet import Outlet
 from velod.runtime.roles import SENSOR_CLOCK_S, SHELLS
 from velod.runtime.shell import WorkerShell
 from velod.types import DepthBatch, Done, EventBatch, FlowBatch, ImuPacket, ImuSamples, Message, Velocity
-from velod.wire import Envelope, decode
-from velod.wire.topics import BATCH_FLOW, DEPTH, DONE, FLOW, HEALTH, IMU, IMU_SENSOR, VELOCITY, Topic, key
+from velod.wire import Envelope, decode, encode
+from velod.wire.topics import ALIVE, BATCH_FLOW, DEPTH, DONE, FLOW, HEALTH, IMU, IMU_SENSOR, VELOCITY, Topic, key
 
 
 class FakeStage:
@@ -193,6 +195,41 @@ def test_what_waited_in_ingest_counts_as_age_because_the_sensor_s_own_packets_di
         bench.outlet.publish(IMU, late)
         out, *_ = bench.wait_for(VELOCITY, 1)  # and those of the packets that the bridge had kept
     assert 160.0 < out.message.age_ms < 1000.0
+
+
+@pytest.mark.parametrize("reached_the_consumer", [4, 5], ids=["all but the last", "all"])
+def test_a_leader_s_last_velocity_reaches_a_client_though_it_died_before_all_had_it(
+    session: zenoh.Session, port: int, reached_the_consumer: int
+) -> None:
+    """Who publishes to several dies between two of them; and nothing is there twice, on the product's own key."""
+
+    def tick(k: int) -> Velocity:
+        return replace(velocity(0, 0), seq=k, t_ns=1_000_000_000 + 13_500_000 * k)
+
+    nothing = np.zeros((0, 3))
+    other = "optimizer-1"
+    token = key(ALIVE, "rig0", stage="optimizer", worker=other)
+    with (
+        Bench(session, "optimizer", FakeStage(lambda m: [replace(velocity(0, 0), t_ns=m.t_ns)])) as bench,
+        VelocityClient("rig0", f"tcp/127.0.0.1:{port}", math.inf) as client,
+    ):
+        while client.receive(0.05) is None:
+            bench.outlet.publish(VELOCITY, tick(0))
+        before = len(bench.heard[VELOCITY.name])
+        bench.shell.inbox.put("tokens", token, b"came")
+        for k in range(1, 6):
+            if k < 5:
+                bench.shell.inbox.put(VELOCITY.name, other, encode(tick(k), time.time_ns()))
+            if k < reached_the_consumer:
+                bench.outlet.publish(VELOCITY, tick(k))
+            samples = ImuSamples(k, tick(k).t_ns, 0, -1, 0, np.zeros(0, np.int64), nothing, nothing)
+            bench.outlet.publish(IMU, samples)
+        bench.shell.inbox.put("tokens", token, b"went")
+        handed_out = [client.receive(5.0) for _ in range(5)]
+        plain = [e.message.seq for e in bench.wait_for(VELOCITY, before + reached_the_consumer)[before:]]
+    assert [v.seq for v in handed_out if v is not None] == [1, 2, 3, 4, 5]
+    assert [v.t_ns for v in handed_out if v is not None] == [tick(k).t_ns for k in range(1, 6)]
+    assert plain == [*range(1, reached_the_consumer), 5]
 
 
 def test_health_tells_counters_gaps_rates_and_alarms(session: zenoh.Session) -> None:

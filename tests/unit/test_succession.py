@@ -38,8 +38,11 @@ def test_a_follower_takes_over_at_once_when_the_leader_s_token_is_gone() -> None
     s = follower(3)
     assert s.role == "standby"
     assert s.offer(3, 3, 3 * TICK_S) == []
-    assert seqs(s.left("optimizer-0", 3 * TICK_S + 0.005)) == [(3, 3)]
-    assert seqs(s.offer(4, 4, 4 * TICK_S)) == [(4, 4)]
+    first = s.left("optimizer-0", 3 * TICK_S + 0.005)
+    assert seqs(first) == [(3, 3)]
+    second = s.offer(4, 4, 4 * TICK_S)
+    assert seqs(second) == [(4, 4)]
+    assert [turn.follows for turn in first + second] == [True, False], "what the other sent last may not have arrived"
 
 
 def test_a_follower_takes_over_from_a_leader_that_falls_silent() -> None:

@@ -19,6 +19,7 @@ from velod.wire.topics import key, parts
         (topics.DEPTH, {}, "velod/rig0/depth"),
         (topics.IMU, {}, "velod/rig0/imu"),
         (topics.VELOCITY, {}, "velod/rig0/velocity"),
+        (topics.VELOCITY_AGAIN, {}, "velod/rig0/velocity/again"),
         (topics.DONE, {"stage": "flow"}, "velod/rig0/done/flow"),
         (topics.HEALTH, {"worker": "flow-1"}, "velod/rig0/health/flow-1"),
         (topics.ALIVE, {"stage": "flow", "worker": "flow-1"}, "velod/rig0/alive/flow/flow-1"),

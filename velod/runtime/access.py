@@ -25,6 +25,7 @@ from velod.wire.topics import (
     PRIME,
     TOPICS,
     VELOCITY,
+    VELOCITY_AGAIN,
     Topic,
     key,
 )
@@ -35,6 +36,7 @@ SERVER: Final = "server"
 
 LOOPBACK_INTERFACES: Final = ("lo", "lo0")
 _SENSOR = (EVENTS, IMU_SENSOR)
+_PRODUCTS = (VELOCITY, VELOCITY_AGAIN, ODOMETRY)
 _QUERIES = (CONFIG, CALIBRATION, ODOMETRY_RESET)
 _ANSWERS = (ALIVE, *_QUERIES)
 _STREAMS = tuple(topic for topic in TOPICS.values() if topic not in _ANSWERS)
@@ -73,8 +75,8 @@ RIGHTS: Final[dict[str, Role]] = {
         is_seen=True,
         sees=True,
     ),
-    "consumer": Role(subscribes=_keys((VELOCITY, ODOMETRY))),
-    "operator": Role(subscribes=_keys((VELOCITY, ODOMETRY, HEALTH)), asks=_keys(_QUERIES), sees=True),
+    "consumer": Role(subscribes=_keys(_PRODUCTS)),
+    "operator": Role(subscribes=_keys((*_PRODUCTS, HEALTH)), asks=_keys(_QUERIES), sees=True),
 }
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections import deque
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -47,12 +48,16 @@ from velod.wire.topics import (
     ODOMETRY,
     ODOMETRY_RESET,
     VELOCITY,
+    VELOCITY_AGAIN,
     Topic,
     key,
 )
 
 OVERTAKING = 64
 """Results of several workers overtake each other by no more than this."""
+AGAIN = 4
+"""So many of another optimizer's last velocities are sent once more by the one that takes over: as many as may be
+made at once, while it is late."""
 SENSOR_CLOCK_S = 0.05
 """How often the optimizer looks at what time the sensor's own packets come."""
 
@@ -218,6 +223,7 @@ class OptimizerShell(WorkerShell):
         self._clock = SensorClock()
         self._sensor_heard: tuple[int, int] | None = None  # sensor time of one of its packets, and its arrival
         self._succession: Succession[_Output] = Succession(worker)
+        self._heard_last: deque[Velocity] = deque(maxlen=AGAIN)  # of the others
         self._odometry_seq = 0
         self._bridge: ImuBridge | None = None
         # A lossless replay waits for ingest instead.
@@ -281,7 +287,8 @@ class OptimizerShell(WorkerShell):
             self.count("velocity.alien", f"a {item.source} that no optimizer of this rig has sent ({item.key!r})")
         elif isinstance(message, Odometry):
             self._odometry_seq = message.seq + 1
-        else:
+        elif isinstance(message, Velocity):
+            self._heard_last.append(message)
             self._succession.heard(item.key, message.t_ns, message.seq, time.monotonic())
         return True
 
@@ -334,11 +341,24 @@ class OptimizerShell(WorkerShell):
 
     def _publish_turns(self, turns: Sequence[Turn[_Output]]) -> None:
         for turn in turns:
+            if turn.follows:
+                self._publish_again()
             age_ms = self._clock.age_ms(turn.output.velocity.t_ns, time.time_ns())
             self._publish_velocity(replace(turn.output.velocity, seq=turn.seq, age_ms=age_ms), turn.output)
             if turn.output.odometry is not None:
                 seq, self._odometry_seq = self._odometry_seq, self._odometry_seq + 1
                 self.outlet.publish(ODOMETRY, replace(turn.output.odometry, seq=seq, age_ms=age_ms))
+
+    def _publish_again(self) -> None:
+        """What another optimizer published last, once more, on a key beside.
+
+        It died or was stopped, and what has come here need not have come to every consumer. Who takes both keys
+        misses nothing; and on the first nothing comes twice.
+        """
+        for velocity in self._heard_last:
+            age_ms = self._clock.age_ms(velocity.t_ns, time.time_ns())
+            self.outlet.publish(VELOCITY_AGAIN, replace(velocity, age_ms=age_ms))
+        self._heard_last.clear()
 
     def _publish_velocity(self, velocity: Velocity, made: _Output) -> None:
         """The first velocity that uses a batch tells how long the batch took from end to end."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
 
 T = TypeVar("T")
@@ -36,6 +36,8 @@ class Turn(Generic[T]):
 
     seq: int
     output: T
+    follows: bool = False
+    """Another one has published what was before it, and may not have come to the end of that."""
 
 
 @dataclass(slots=True)
@@ -151,7 +153,8 @@ class Succession(Generic[T]):
     def _take_over(self) -> list[Turn[T]]:
         self.leads, self._leader, self._regain_s = True, "", math.inf
         self.counters["succession.led"] = self.counters.get("succession.led", 0) + 1
-        return self._release()
+        first, *others = self._release()
+        return [replace(first, follows=True), *others]
 
     def _release(self) -> list[Turn[T]]:
         turns = [Turn(self._seq + i, held.output) for i, held in enumerate(self._held)]

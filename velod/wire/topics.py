@@ -39,6 +39,7 @@ FLOW = Topic("flow", "velod/{rig}/flow", types.FlowBatch, 50.0, 0.5, _STREAM)
 DEPTH = Topic("depth", "velod/{rig}/depth", types.DepthBatch, 50.0, 0.5, _STREAM)
 IMU = Topic("imu", "velod/{rig}/imu", types.ImuSamples, 250.0, 0.5, _STREAM)
 VELOCITY = Topic("velocity", "velod/{rig}/velocity", types.Velocity, 75.0, 0.2, Qos("real_time", 8))
+VELOCITY_AGAIN = Topic("velocity_again", "velod/{rig}/velocity/again", types.Velocity, 0.0, 0.0, VELOCITY.qos)
 ODOMETRY = Topic("odometry", "velod/{rig}/odometry", types.Odometry, 75.0, 0.0, Qos("data_high", 8))
 ODOMETRY_RESET = Topic("odometry_reset", "velod/{rig}/odometry/reset", None, 0.0, 0.0)
 DONE = Topic("done", "velod/{rig}/done/{stage}", types.Done, 50.0, 0.0, Qos("data_high", 256))
@@ -59,6 +60,7 @@ TOPICS: dict[str, Topic] = {
         DEPTH,
         IMU,
         VELOCITY,
+        VELOCITY_AGAIN,
         ODOMETRY,
         ODOMETRY_RESET,
         DONE,
