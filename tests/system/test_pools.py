@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import time
+from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -30,7 +31,7 @@ with open_session(ZenohSettings(port=int(sys.argv[1]))) as session:
     {how}
         print("up", flush=True)
         while True:
-            session.put("velod/rig0/prime", bytes(262_144))
+            session.put("velod/rig0/prime", bytes([7]) * 262_144)
             time.sleep(0.02)
 """
 OWNING = 'with prime(session, "rig0"):'
@@ -38,13 +39,14 @@ NOT_OWNING = "if True:"  # a driver that is not velod's
 
 
 @pytest.fixture
-def receiver(port: int) -> Iterator[None]:
-    """Takes large messages in this process."""
+def receiver(port: int) -> Iterator[deque[bytes]]:
+    """Takes large messages in this process, and keeps the newest."""
+    newest: deque[bytes] = deque(maxlen=1)
     with (
         open_session(ZenohSettings(port=port), introducer=True) as session,
-        session.declare_subscriber(key(PRIME, "rig0"), lambda _: None),
+        session.declare_subscriber(key(PRIME, "rig0"), lambda sample: newest.append(sample.payload.to_bytes())),
     ):
-        yield
+        yield newest
 
 
 def send(port: int, how: str = OWNING) -> subprocess.Popen[str]:
@@ -88,6 +90,28 @@ def test_the_pool_of_a_dead_sender_is_given_back_and_that_of_a_living_one_stays(
         for sender in (dead, living):
             sender.kill()
             sender.wait()
+
+
+def test_who_has_no_use_for_a_pool_holds_none_of_it_and_reads_what_comes_all_the_same(
+    port: int, receiver: deque[bytes]
+) -> None:
+    """A new link carries everything until its ends have told each other what they want: any process may map one."""
+    keeper = PoolKeeper(takes_large=False)
+    before = mapped_bytes()
+    sender = send(port)
+    try:
+        assert mapped_bytes() - before >= POOL_BYTES
+        assert keeper.look(0.0) == 0
+        assert mapped_bytes() - before < 0.1 * POOL_BYTES
+        receiver.clear()
+        deadline_s = time.monotonic() + 5.0
+        while not receiver:
+            assert time.monotonic() < deadline_s, "nothing comes any more"
+            time.sleep(0.01)
+        assert set(receiver.pop()) == {7}
+    finally:
+        sender.kill()
+        sender.wait()
 
 
 @pytest.mark.usefixtures("receiver")

@@ -146,14 +146,15 @@ def _soak(args: argparse.Namespace) -> int:
     print(
         f"{result.seconds:.0f} s; faults: {hits or 'none'}; {result.served} valid velocities;"
         f" the longest time without one: {result.gap()}; latency {result.latency_middle_ms:.1f} ms in the middle,"
-        f" {result.latency_last_ms:.1f} ms in the end",
+        f" {result.latency_last_ms:.1f} ms in the end; shared memory of all {result.shared_mib:.0f} MiB"
+        f" ({result.shared_growth_mib:+.1f} MiB since the beginning)",
         file=out,
     )
     for p in result.processes:
         print(
             f"{p.worker:<14} {p.seconds:6.0f} s  {p.mib:6.1f} MiB, {p.files} files; in the last third"
             f" {p.growth_mib:+.2f} MiB ({p.slope_mib_h:+.2f} MiB/h), {p.new_files:+d} files;"
-            f" for each death {p.death_mib:+.2f} MiB, {p.death_files:+.1f} files",
+            f" kept of each death {p.death_mib:+.2f} MiB, {p.death_files:+.1f} files",
             file=out,
         )
     return _end(args, asdict(result), result.failures())

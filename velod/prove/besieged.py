@@ -110,6 +110,10 @@ class Besieged(Stacked):
         """What a worker said of itself last."""
         return self._health[worker]
 
+    def gauge_of(self, pid: int, name: str) -> float:
+        """What a process has said of itself last; 0 where it says nothing of that."""
+        return next((h.gauges.get(name, 0.0) for h in self._health.values() if h.pid == pid), 0.0)
+
     def counted(self, worker: str, prefix: str) -> int:
         """The sum of a worker's counters that begin with ``prefix``."""
         return sum(n for name, n in self._health[worker].counters.items() if name.startswith(prefix))

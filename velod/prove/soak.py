@@ -3,8 +3,9 @@
 All is as a user has it: `velod run`, a driver and a consumer, both over TLS. Workers are hit by kill -9 or SIGSTOP:
 those of all four kinds in the first third, flow and depth alone in the second, so that the memory of the others can
 be followed (a process that was replaced says nothing of leaks), and none in the last, in which nothing may grow. What
-each death costs those who live on is told apart, shared memory included: Zenoh keeps that of a peer that died mapped,
-64 MiB of it until velod empties it (``velod.runtime.pools``), and 1.3 MiB and two files for ever.
+each death costs those who live on is told apart (``holding``), and so is shared memory, of which the host has one
+however many processes map it: Zenoh keeps that of a peer that died, 64 MiB of it until velod empties it
+(``velod.runtime.pools``), and 1.3 MiB and two files for ever.
 """
 
 from __future__ import annotations
@@ -16,27 +17,28 @@ import signal
 import time
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from velod.prove.besieged import Besieged
-from velod.prove.processes import held_mib, open_files
+from velod.prove.holding import KILL, WARM_UP_S, Hit, Lasting, Series, judge
+from velod.prove.processes import open_files, own_mib, shared_memory_mib
+from velod.runtime.heap import KEPT
 
 SAMPLE_S = 1.0
 STOPPED_S = 3.0
-WARM_UP_S = 10.0
-"""Of a process, before its memory is looked at."""
-SETTLED_S = 60.0
-"""A worker that was started anew fills its buffers for so long."""
 LONG_S = 1500.0
 """Only a run so long can tell a slope of 1 MiB an hour from the noise of an allocator."""
 MAX_SLOPE_MIB_H = 1.0
 MAX_GROWTH_MIB = 4.0
 """In the last third of a shorter run."""
 MAX_DEATH_MIB, MAX_DEATH_FILES = 8.0, 3.0
-"""Of every other process, for each worker that was killed. Measured: 1 to 4 MiB, 1 or 2 files."""
+"""Of every other process, for each worker that was killed. Measured: 0 to 4 MiB, 1 or 2 files."""
+MAX_SHARED_MIB, MAX_DEATH_SHARED_MIB = 16.0, 2.0
+"""By so much may the host's shared memory grow, a quarter of a pool, and for each worker that was killed besides:
+measured 1.3 MiB, which Zenoh keeps."""
 MAX_DRIFT, MAX_DRIFT_SHORT = 1.5, 3.0
 """Median latency of the last third over that of the middle one; of a shorter run, which others may disturb."""
 MAX_GAP_S = 2 * STOPPED_S
@@ -44,36 +46,6 @@ MAX_GAP_S = 2 * STOPPED_S
 ON_ITS_WAY_S = 0.1
 """A gap begins with the last velocity before it, up to so long before the fault that made it."""
 _ANY, _STATELESS = ("ingest-0", "flow-0", "depth-0", "optimizer-0"), ("flow-0", "depth-0")
-
-
-@dataclass(slots=True)
-class Series:
-    """What one process held, second by second; it begins anew where the process does."""
-
-    pid: int
-    t_s: list[float] = field(default_factory=list)
-    mib: list[float] = field(default_factory=list)
-    files: list[int] = field(default_factory=list)
-
-    def between(self, start_s: float, end_s: float) -> tuple[list[float], list[float], list[int]]:
-        """Times, memory and files of a part of the run."""
-        part = slice(int(np.searchsorted(self.t_s, start_s)), int(np.searchsorted(self.t_s, end_s)))
-        return self.t_s[part], self.mib[part], self.files[part]
-
-
-@dataclass(frozen=True, slots=True)
-class Lasting:
-    """One process that lived through the last two thirds."""
-
-    worker: str
-    seconds: float
-    mib: float
-    files: int
-    slope_mib_h: float  # of a line through the last third
-    growth_mib: float  # in the last third, by that line
-    new_files: int  # in the last third
-    death_mib: float  # more in the first two thirds, for each worker killed meanwhile; NaN: none was
-    death_files: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,6 +61,8 @@ class Soak:
     gap_heard: str  # states and reasons of invalid velocities in it, and alarms of all processes
     latency_middle_ms: float  # batch closed to velocity out, median of the middle third
     latency_last_ms: float
+    shared_mib: float  # the host's, of all processes, each piece once
+    shared_growth_mib: float  # since the first faults
     processes: list[Lasting]
 
     def failures(self) -> list[str]:
@@ -103,6 +77,9 @@ class Soak:
                 found.append(f"{p.worker} has {p.new_files} more files open")
             if p.death_mib > MAX_DEATH_MIB or p.death_files > MAX_DEATH_FILES:
                 found.append(f"{p.worker} keeps {p.death_mib:.1f} MiB, {p.death_files:.1f} files of each dead worker")
+        deaths = sum(n for fault, n in self.faults.items() if fault.startswith(KILL))
+        if self.shared_growth_mib > MAX_SHARED_MIB + deaths * MAX_DEATH_SHARED_MIB:
+            found.append(f"shared memory grew by {self.shared_growth_mib:.0f} MiB over {deaths} deaths")
         drift = MAX_DRIFT if self.seconds >= LONG_S else MAX_DRIFT_SHORT
         if self.latency_last_ms > drift * self.latency_middle_ms:
             found.append(f"latency rose from {self.latency_middle_ms:.1f} to {self.latency_last_ms:.1f} ms")
@@ -125,14 +102,16 @@ def soak(recording: Path, seconds: float, fault_every_s: float, seed: int, on_fa
     chance = random.Random(seed)
     series: dict[str, Series] = {}
     latency_ms: list[tuple[float, float]] = []
-    hits: list[tuple[float, str]] = []
+    shared_mib: list[float] = []
+    hits: list[Hit] = []
     with Besieged(recording, speed=1.0) as target:
         start_s = time.monotonic()
         next_fault_s = start_s + fault_every_s
         seen, served = -1, target.n_heard()
         while (elapsed_s := time.monotonic() - start_s) < seconds:
             time.sleep(SAMPLE_S)
-            _sample(target, series, elapsed_s)
+            _sample(target, series, time.monotonic() - start_s)
+            shared_mib.append(shared_memory_mib(target.process_ids().values()))
             health = target.health_of("optimizer-0")
             if health.seq != seen and "end_to_end_p50" in health.latency_ms:
                 seen = health.seq
@@ -144,7 +123,6 @@ def soak(recording: Path, seconds: float, fault_every_s: float, seed: int, on_fa
                 next_fault_s = time.monotonic() + fault_every_s * chance.uniform(0.7, 1.3)
         gap = target.longest_gap()
         gap_begun_s = gap.begun_s - start_s
-        killed_s = [hit_s for hit_s, fault in hits if fault.startswith("kill")]
         return Soak(
             elapsed_s,
             dict(Counter(fault for _, fault in hits)),
@@ -155,7 +133,9 @@ def soak(recording: Path, seconds: float, fault_every_s: float, seed: int, on_fa
             str(gap),
             _median(latency_ms, seconds / 3, 2 * seconds / 3),
             _median(latency_ms, 2 * seconds / 3, seconds),
-            [_judge(w, s, seconds, killed_s) for w, s in sorted(series.items()) if _lasted(s, seconds)],
+            shared_mib[-1],
+            shared_mib[-1] - shared_mib[0],
+            [judge(w, s, seconds, hits) for w, s in sorted(series.items()) if s.lasted(seconds)],
         )
 
 
@@ -166,7 +146,7 @@ def _hit(target: Besieged, chance: random.Random, workers: tuple[str, ...]) -> s
     try:
         if chance.random() < 0.5:
             os.kill(pid, signal.SIGKILL)
-            return f"kill {worker}"
+            return f"{KILL}{worker}"
         os.kill(pid, signal.SIGSTOP)
         time.sleep(chance.uniform(0.1, STOPPED_S))
         os.kill(pid, signal.SIGCONT)
@@ -175,7 +155,7 @@ def _hit(target: Besieged, chance: random.Random, workers: tuple[str, ...]) -> s
     return f"stop {worker}"
 
 
-def _last_before(t_s: float, hits: list[tuple[float, str]]) -> str:
+def _last_before(t_s: float, hits: list[Hit]) -> str:
     """The last fault before the gap that began at ``t_s``, which a velocity on its way may have put off."""
     before = [f"{fault} at {hit_s:.1f} s" for hit_s, fault in hits if hit_s < t_s + ON_ITS_WAY_S]
     return before[-1] if before else "no fault"
@@ -185,37 +165,11 @@ def _sample(target: Besieged, series: dict[str, Series], t_s: float) -> None:
     for worker, pid in {**target.process_ids(), "driver": target.driver_pid}.items():
         if worker not in series or series[worker].pid != pid:
             series[worker] = Series(pid)
-        if (mib := held_mib(pid)) > 0.0:
+        if (mib := own_mib(pid)) > 0.0:
             series[worker].t_s.append(t_s)
             series[worker].mib.append(mib)
+            series[worker].used_mib.append(mib - target.gauge_of(pid, KEPT))
             series[worker].files.append(open_files(pid))
-
-
-def _lasted(series: Series, seconds: float) -> bool:
-    """Whether a process was there long enough before the last third, and to the end."""
-    begun_s, ended_s = (series.t_s[0], series.t_s[-1]) if series.t_s else (math.inf, 0.0)
-    return begun_s < max(2 * SAMPLE_S, 2 * seconds / 3 - SETTLED_S) and ended_s > 0.9 * seconds
-
-
-def _judge(worker: str, series: Series, seconds: float, killed_s: list[float]) -> Lasting:
-    quiet_s = 2 * seconds / 3
-    begun_s = series.t_s[0] + WARM_UP_S
-    t_s, mib, files = series.between(quiet_s, math.inf)
-    _, mib_before, files_before = series.between(begun_s, quiet_s)
-    slope_mib_s = float(np.polyfit(t_s, mib, 1)[0]) if len(t_s) > 2 else math.nan
-    half = len(files) // 2
-    deaths = sum(t >= begun_s for t in killed_s) or math.nan
-    return Lasting(
-        worker=worker,
-        seconds=series.t_s[-1] - series.t_s[0],
-        mib=series.mib[-1],
-        files=series.files[-1],
-        slope_mib_h=slope_mib_s * 3600.0,
-        growth_mib=slope_mib_s * (t_s[-1] - t_s[0]) if t_s else math.nan,
-        new_files=int(np.median(files[half:]) - np.median(files[:half])) if half else 0,
-        death_mib=(mib_before[-1] - mib_before[0]) / deaths if mib_before else math.nan,
-        death_files=(files_before[-1] - files_before[0]) / deaths if files_before else math.nan,
-    )
 
 
 def _median(samples: list[tuple[float, float]], start_s: float, end_s: float) -> float:

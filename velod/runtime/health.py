@@ -7,6 +7,7 @@ import socket
 import time
 from importlib.metadata import PackageNotFoundError, version
 
+from velod.runtime.heap import heap_gauges
 from velod.runtime.measure import LatencyRing
 from velod.types import Health
 
@@ -70,7 +71,7 @@ class HealthReporter:
             latency_ms=self._latency_ms(),
             alarms=alarms,
             role=role,
-            gauges=gauges or {},
+            gauges={**(gauges or {}), **heap_gauges()},
         )
         self._seq += 1
         self._last_s, self._before = now_s, dict(counters)

@@ -27,11 +27,12 @@ import zenoh
 
 from velod.config import Settings, ZenohSettings
 from velod.runtime.callbacks import direct
+from velod.runtime.heap import keep_memory
 from velod.runtime.outlet import Outlet
 from velod.runtime.process import ChildProcess, stop_all
 from velod.runtime.session import introducer_endpoint, open_session
 from velod.runtime.shell import WorkerShell
-from velod.runtime.worker import keep_memory, prepare_process
+from velod.runtime.worker import prepare_process
 from velod.types import EventPacket, Message
 from velod.wire import Envelope, encode
 from velod.wire.topics import EVENTS, Topic

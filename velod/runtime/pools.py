@@ -5,6 +5,9 @@ and Zenoh keeps that mapping for the life of the receiver: each death of a sende
 receiver. So a sender of velod puts a lock on its pool's file, which the kernel drops with the process, however that
 ends; receivers look once a second, and empty those pools whose lock is gone. Pools that never were locked, of drivers
 that are not velod's, are left alone: nobody can tell whether their owner lives. Linux only; elsewhere all stays.
+
+Processes that take no large messages get one all the same, now and then: until a new link's two ends have told each
+other what they want, Zenoh sends everything. They then map the sender's pool, have no use for it, and let go of it.
 """
 
 from __future__ import annotations
@@ -40,6 +43,7 @@ _NAME: Final = re.compile(r"/dev/shm/\d+\.zenoh(?: \(deleted\))?")
 _MAPPING: Final = re.compile(r"([0-9a-f]+)-([0-9a-f]+) \S+ [0-9a-f]+ \S+ (\d+)\s+/dev/shm/\d+\.zenoh")
 _LOCK: Final = "hhqqi4x"  # struct flock, 64 bits
 _PUNCH_HOLE_KEEP_SIZE: Final = 3
+_DONT_NEED: Final = 4
 
 
 @contextmanager
@@ -64,9 +68,13 @@ def owned(since_ns: int) -> Iterator[int]:
 
 
 class PoolKeeper:
-    """Gives back the pools whose owners are gone. Call ``look`` about once a second."""
+    """Gives back the pools whose owners are gone. Call ``look`` about once a second.
 
-    def __init__(self) -> None:
+    ``takes_large``: whether the process has a use for the pools of others.
+    """
+
+    def __init__(self, *, takes_large: bool = True) -> None:
+        self._takes_large = takes_large
         self._seen_locked_s: dict[int, float] = {}  # by the file's number: when its owner was last alive
 
     def look(self, now_s: float) -> int:
@@ -76,6 +84,8 @@ class PoolKeeper:
             try:
                 if _is_locked(file):
                     seen[number] = now_s
+                    if not self._takes_large:
+                        _let_go(number)
                 elif number in self._seen_locked_s:
                     if now_s - self._seen_locked_s[number] < GRACE_S:
                         seen[number] = self._seen_locked_s[number]
@@ -139,14 +149,22 @@ else:
 
 
 def _empty(file: int, number: int) -> None:
-    """Unlock a pool's mapping here, and free its memory for all who map it: what is read there is zero now."""
-    libc = ctypes.CDLL(None, use_errno=True)
-    for mapping in _MAPPING.finditer(Path("/proc/self/maps").read_text()):
-        if int(mapping[3]) == number:
-            start, end = int(mapping[1], 16), int(mapping[2], 16)
-            libc.munlock(ctypes.c_void_p(start), ctypes.c_size_t(end - start))
+    """Free a pool's memory for all who map it: what is read there is zero now."""
+    libc = _let_go(number)
     size = os.fstat(file).st_size
     if libc.fallocate(file, _PUNCH_HOLE_KEEP_SIZE, ctypes.c_int64(0), ctypes.c_int64(size)) == 0:
         log.info("%.0f MiB of shared memory given back: its owner is gone", size / (1 << 20))
     else:
         log.warning("shared memory of a process that is gone stays: %s", os.strerror(ctypes.get_errno()))
+
+
+def _let_go(number: int) -> ctypes.CDLL:
+    """Hold no page of a pool in this process any more; one that is read all the same comes back as it was."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    for mapping in _MAPPING.finditer(Path("/proc/self/maps").read_text()):
+        if int(mapping[3]) == number:
+            start = int(mapping[1], 16)
+            place = ctypes.c_void_p(start), ctypes.c_size_t(int(mapping[2], 16) - start)
+            libc.munlock(*place)
+            libc.madvise(*place, _DONT_NEED)
+    return libc

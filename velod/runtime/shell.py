@@ -71,7 +71,7 @@ class WorkerShell:
         self._gaps: dict[str, tuple[str, GapCounter]] = {}  # by key: topic and counter
         self._heard: dict[str, tuple[Topic, float]] = {}  # by key: when the last message came
         self._logged: set[str] = set()
-        self._pools = PoolKeeper()
+        self._pools = PoolKeeper(takes_large=self.takes_large)
         self._tidying = stage if isinstance(stage, Tidying) else None
         self._t_ns = 0
         self.arrived_ns = 0  # host clock, when what is being handled came in; it may have waited since
