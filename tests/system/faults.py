@@ -97,7 +97,7 @@ def _stopped(pid: int, seconds: float) -> Span:
 
 
 def _kill_supervisor(rig: Rig) -> Span:
-    """Its workers go with it; what systemd does is done here: start it again, which ends the fault."""
+    """Its workers go on; what systemd does is done here: start it again, which ends the fault."""
     assert rig.service is not None
     span = _now(), _now()
     rig.service.kill()

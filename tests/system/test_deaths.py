@@ -8,13 +8,18 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from velod.config import FlowSettings, Settings, ZenohSettings
+from tests.system.rig import Stalls
+from velod import config
+from velod.client import VelocityClient
+from velod.config import FlowSettings, RigSettings, Settings, ZenohSettings
+from velod.geometry.calibration import save_calibration
 from velod.io import open_recording
 from velod.runtime.online import OnlineResult, run_online
 from velod.runtime.player import player_command
@@ -309,6 +314,67 @@ def test_a_supervisor_that_ends_leaves_no_process(port: int, number: signal.Sign
     _, log = service.communicate(timeout=10.0)
     assert are_gone(children, within_s=2.0)
     assert service.returncode == (-signal.SIGKILL if number == signal.SIGKILL else 0)
+    assert "Traceback" not in log
+
+
+def velod_run(stack: ExitStack, folder: Path, port: int, recording: Path, name: str) -> subprocess.Popen[bytes]:
+    """``velod run`` as a user has it; its log is ``name`` in the folder."""
+    rig, settings = folder / "rig.yaml", folder / "velod.toml"
+    save_calibration(rig, open_recording(recording).calibration)
+    service = Settings(rig=RigSettings("rig0", str(rig)), zenoh=ZenohSettings(port=port))
+    settings.write_text(config.to_toml(service), "utf-8")
+    command = [sys.executable, "-P", "-m", "velod.cli", "run", "-c", str(settings)]
+    return started(stack, command, folder / name)
+
+
+def started(stack: ExitStack, command: list[str], log: Path) -> subprocess.Popen[bytes]:
+    """A process that does not outlive the test."""
+    with log.open("w") as file:
+        process = subprocess.Popen(command, stderr=file)
+    stack.callback(process.wait)
+    stack.callback(process.terminate)
+    return process
+
+
+def wait_for_lines(log: Path, text: str, times: int, within_s: float = 60.0) -> None:
+    deadline_s = time.monotonic() + within_s
+    while log.read_text().count(text) < times:
+        assert time.monotonic() < deadline_s, f"not {times} times {text!r}:\n{log.read_text()}"
+        time.sleep(0.05)
+
+
+@pytest.mark.timed
+@pytest.mark.skipif(sys.platform != "linux", reason="workers outlive their supervisor on Linux alone")
+def test_a_supervisor_that_is_killed_and_started_again_costs_no_velocity(
+    slanted: Path, port: int, tmp_path: Path
+) -> None:
+    """Its workers go on, and are the next one's; that one ends them in good order."""
+    zenoh, heard_s, ticks_ns = ZenohSettings(port=port), [], []
+    player = [*player_command(str(slanted), zenoh, "rig0"), "--repeat", "inf"]
+    with ExitStack() as stack:
+        first = velod_run(stack, tmp_path, port, slanted, "first")
+        wait_for_lines(tmp_path / "first", "INFO up", len(STAGES))
+        wait_for_lines(tmp_path / "first", "spare is ready", 1)
+        workers = children_of(first.pid)
+        started(stack, player, tmp_path / "player")
+        stalls = stack.enter_context(Stalls())
+        client = stack.enter_context(VelocityClient("rig0", f"tcp/127.0.0.1:{port}"))
+        while len(heard_s) < 450:
+            velocity = client.receive(10.0)
+            assert velocity is not None
+            heard_s.append(time.monotonic())
+            ticks_ns.append(velocity.t_ns)
+            if len(heard_s) == 100:
+                first.kill()
+            if len(heard_s) == 150:
+                second = velod_run(stack, tmp_path, port, slanted, "second")
+    log = (tmp_path / "second").read_text()
+    assert log.count("left at work by another supervisor, goes on") == log.count("INFO up") == len(STAGES)
+    assert not any("process" in line and "started" in line for line in log.splitlines())
+    assert np.diff(heard_s).max() <= 0.1 + 2.0 * stalls.longest_s
+    assert np.diff(ticks_ns).max() < 20_000_000
+    assert second.returncode == 0
+    assert are_gone(workers, within_s=1.0)
     assert "Traceback" not in log
 
 

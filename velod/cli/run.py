@@ -35,13 +35,14 @@ def run(
         raise ConfigError(
             f"{config or 'defaults'}: rig.calibration: missing; the service beside a sensor needs it or --calibration"
         )
+    from velod.runtime.custody import OUTLIVE_S
     from velod.runtime.stages import STAGES
     from velod.runtime.supervisor import Supervisor
     from velod.runtime.worker import start_logging, stop_on_signals
 
     start_logging("supervisor")
     stop = stop_on_signals()
-    with Supervisor(settings, calibration, only or STAGES, worker or "") as supervisor:
+    with Supervisor(settings, calibration, only or STAGES, worker or "", outlive_s=OUTLIVE_S) as supervisor:
         supervisor.run(stop)
     return 0
 

@@ -45,6 +45,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     niceness = _WANTED_NICENESS if known.worker else _NICENESS
     quietly(_import_all, niceness)
     from velod.runtime import worker
+    from velod.runtime.custody import identity
     from velod.runtime.session import open_session
     from velod.runtime.settings_service import fetch
     from velod.runtime.stages import stage_of
@@ -62,7 +63,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             name = args.worker or _wait_for_order(stop)
             if name:
                 worker.start_logging(name)
-                worker.serve_stage(session, settings, name, stages[stage_of(name)], stop)
+                with worker.in_custody(args, name, identity(settings, calibration), stop):
+                    worker.serve_stage(session, settings, name, stages[stage_of(name)], stop)
     except (OSError, ValueError) as e:
         worker.log.error("%s", e)
         return worker.EXIT_USAGE

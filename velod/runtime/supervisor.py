@@ -1,7 +1,8 @@
 """The supervisor of ``velod run``: introducer, server of settings, and the one who restarts what dies.
 
 Every worker gets settings and calibration over Zenoh, so a worker on another host starts the same way as one here.
-One warm spare process stands by: a dead worker is replaced by it at once, and a new spare is made ready.
+One warm spare process stands by: a dead worker is replaced by it at once, and a new spare is made ready. Workers of a
+supervisor that was killed go on, where that was asked for, and the next one takes them over (``adoption``).
 """
 
 from __future__ import annotations
@@ -20,11 +21,13 @@ import zenoh
 
 from velod.config import Settings
 from velod.geometry.calibration import Calibration
+from velod.runtime.adoption import adopt
 from velod.runtime.callbacks import direct
+from velod.runtime.custody import Place, identity
 from velod.runtime.health import HealthReporter
 from velod.runtime.outlet import Outlet
 from velod.runtime.pools import PoolKeeper
-from velod.runtime.process import ChildProcess, LineSink, stop_all, to_stderr
+from velod.runtime.process import AdoptedProcess, ChildProcess, LineSink, WatchedProcess, stop_all, to_stderr
 from velod.runtime.session import introducer_endpoint, open_session
 from velod.runtime.settings_service import fetch, serve
 from velod.runtime.spare import READY
@@ -52,7 +55,7 @@ class _Slot:
 
     worker: str
     is_further: bool = False  # of its stage, so that others work while it starts for the first time
-    process: ChildProcess | None = None
+    process: WatchedProcess | None = None
     restarts: int = 0
     quick_deaths: int = 0  # in a row, each soon after its start
     due_s: float = 0.0  # when to start the next one
@@ -71,10 +74,13 @@ class Supervisor(Stacked):
         worker: str = "",
         spare: bool = True,
         on_line: LineSink = to_stderr,
+        outlive_s: float = 0.0,
     ) -> None:
         """``stages``: which of them run here. ``worker``: the name of the only one. ``calibration`` may be None
-        where ``settings.zenoh.connect`` names another host's service, which is then asked for both. Raises
-        ValueError for names that are none.
+        where ``settings.zenoh.connect`` names another host's service, which is then asked for both. ``outlive_s``:
+        so long do workers outlive a supervisor that was killed, for another one to take them over; not where the
+        service is another host's, or is reached by a configuration of the user's. Raises ValueError for names that
+        are none.
         """
         unknown = set(stages) - set(STAGES)
         if unknown or not stages:
@@ -86,6 +92,9 @@ class Supervisor(Stacked):
         self._settings, self._calibration = settings, calibration
         self._stages, self._worker, self._wants_spare = tuple(stages), worker, spare
         self._on_line = on_line
+        # Whoever has the introducer's port is the only supervisor.
+        is_alone = not (settings.zenoh.connect or settings.zenoh.config)
+        self._outlive_s = outlive_s if is_alone else 0.0
         self._slots: dict[str, _Slot] = {}
         self._further: list[_Slot] = []  # not yet started: a stage's second workers and so on
         self._spare: ChildProcess | None = None
@@ -94,7 +103,7 @@ class Supervisor(Stacked):
         self._alive_lock = Lock()
         self._name = f"supervisor-{socket.gethostname().split('.')[0]}" if settings.zenoh.connect else "supervisor"
         self._health = HealthReporter("supervisor", self._name)
-        self._pools = PoolKeeper()
+        self._pools = PoolKeeper(takes_large=False)
         self.session: Any = None
 
     def _open(self, stack: ExitStack) -> None:
@@ -108,8 +117,10 @@ class Supervisor(Stacked):
         self._outlet = stack.enter_context(Outlet(self.session, self._settings.rig.name))
         self._watch_liveliness(stack)
         stack.callback(self.stop_workers)
-        for name in self._names():
-            self._slots[name] = slot = _Slot(name, stage_of(name) in map(stage_of, self._slots))
+        left_behind = self._left_behind(names := self._names())
+        for name in names:
+            is_further = name not in left_behind and stage_of(name) in map(stage_of, self._slots)
+            self._slots[name] = slot = _Slot(name, is_further, left_behind.get(name))
             if slot.is_further:
                 slot.due_s = time.monotonic() + HEAD_START_S
                 self._further.append(slot)
@@ -160,7 +171,7 @@ class Supervisor(Stacked):
 
     def stop_workers(self) -> None:
         """End all workers and start none any more; the session stays open for their last words."""
-        children = [s.process for s in self._slots.values() if s.process is not None]
+        children: list[WatchedProcess] = [s.process for s in self._slots.values() if s.process is not None]
         stop_all(children if self._spare is None else [*children, self._spare])
         self._slots.clear()
         self._spare, self._wants_spare = None, False
@@ -202,6 +213,16 @@ class Supervisor(Stacked):
             names += self._free_names(stage, len(wanted)) if self._settings.zenoh.connect else wanted
         return names
 
+    def _left_behind(self, names: Sequence[str]) -> dict[str, AdoptedProcess]:
+        """Workers that a supervisor before this one has left at work."""
+        if not self._outlive_s or self._calibration is None:
+            return {}
+        place = Place(introducer_endpoint(self._settings.zenoh), self._settings.rig.name)
+        adopted = adopt(place, names, identity(self._settings, self._calibration), self._on_line)
+        for name, process in adopted.items():
+            log.warning("%s: process %d, left at work by another supervisor, goes on", name, process.pid)
+        return adopted
+
     def _free_names(self, stage: str, count: int) -> list[str]:
         """Names that nobody has at the service that is connected to."""
         replies = self.session.liveliness().get(key(ALIVE, self._settings.rig.name, stage=stage), timeout=1.0)
@@ -221,7 +242,7 @@ class Supervisor(Stacked):
         stack.enter_context(watch)
 
     def _command(self, module: str, worker: str) -> list[str]:
-        arguments = worker_arguments(self._settings.zenoh, self._settings.rig.name, worker)
+        arguments = worker_arguments(self._settings.zenoh, self._settings.rig.name, worker, self._outlive_s)
         return [sys.executable, "-P", "-m", module, *arguments]
 
     def _start(self, slot: _Slot) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import ctypes
 import gc
 import logging
 import os
@@ -11,12 +10,15 @@ import signal
 import socket
 import sys
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from threading import Event, Thread
 
 import zenoh
 
 from velod.config import Settings, ZenohSettings
 from velod.runtime.access import ROLES
+from velod.runtime.custody import Place, custody, identity
+from velod.runtime.heap import keep_memory
 from velod.runtime.kernel_cache import ensure_cache_directory
 from velod.runtime.parent import die_with
 from velod.runtime.session import introducer_endpoint, open_session
@@ -25,9 +27,6 @@ from velod.runtime.stages import Stage, create_stage, stage_of
 
 EXIT_USAGE = 2
 _SWITCH_INTERVAL_S = 0.0005
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
-_KEPT_BYTES = 32 << 20
-"""The largest that glibc takes for blocks that are not mapped one by one."""
 
 log = logging.getLogger("velod")
 
@@ -47,7 +46,8 @@ def main(stage: str, argv: Sequence[str] | None = None) -> int:
             settings, calibration = fetch(session, args.rig, args.connect)
             built = create_stage(stage, settings, calibration)
             warmup.warm_up(stage, settings, calibration)
-            serve_stage(session, settings, args.worker, built, stop)
+            with in_custody(args, args.worker, identity(settings, calibration), stop):
+                serve_stage(session, settings, args.worker, built, stop)
     except (OSError, ValueError) as e:
         log.error("%s", e)
         return EXIT_USAGE
@@ -65,10 +65,15 @@ def serve_stage(session: zenoh.Session, settings: Settings, worker: str, stage: 
     SHELLS[name](session, settings, name, worker, stage).run(stop)
 
 
-def worker_arguments(settings: ZenohSettings, rig: str, worker: str) -> list[str]:
+def in_custody(args: argparse.Namespace, worker: str, who: bytes, stop: Event) -> AbstractContextManager[None]:
+    """The custody of a worker that was started with these arguments."""
+    return custody(Place(args.connect, args.rig), worker, args.parent, args.outlive, who, stop)
+
+
+def worker_arguments(settings: ZenohSettings, rig: str, worker: str, outlive_s: float = 0.0) -> list[str]:
     """The command line of a worker that belongs to a service with these settings."""
     arguments = ["--connect", introducer_endpoint(settings), "--rig", rig, "--worker", worker]
-    arguments += ["--parent", str(os.getpid())]
+    arguments += ["--parent", str(os.getpid()), "--outlive", f"{outlive_s:g}"]
     if settings.listen:
         arguments += ["--listen", settings.listen]
     if settings.keys:
@@ -115,6 +120,7 @@ def worker_parser(program: str, worker: str) -> argparse.ArgumentParser:
     parser.add_argument("--no-shared-memory", action="store_true", help="TCP only, within this host as well")
     parser.add_argument("--lossless", action="store_true", help="replay: keep a link that blocks for longer")
     parser.add_argument("--parent", type=int, default=0, help="process id of the supervisor, to die with it")
+    parser.add_argument("--outlive", type=float, default=0.0, help="seconds for which to wait for another supervisor")
     return parser
 
 
@@ -135,16 +141,6 @@ def prepare_process(parent: int) -> None:
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
     keep_memory()
     ensure_cache_directory()
-
-
-def keep_memory() -> None:
-    """Have the C library keep what is freed (glibc): it comes back as fast as it went.
-
-    Given back to the kernel, the memory of each large message would be mapped anew page by page: 0.3 ms for 405 KB.
-    """
-    if sys.platform == "linux" and hasattr(libc := ctypes.CDLL(None), "mallopt"):
-        libc.mallopt(_M_MMAP_THRESHOLD, _KEPT_BYTES)
-        libc.mallopt(_M_TRIM_THRESHOLD, 4 * _KEPT_BYTES)
 
 
 def stop_on_signals() -> Event:
