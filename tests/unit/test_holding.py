@@ -93,7 +93,14 @@ def test_shared_memory_is_counted_once_and_by_what_it_holds() -> None:
 
 def test_growth_after_the_last_fault_is_told_apart_from_what_deaths_cost() -> None:
     series = held({})
-    series.mib = [mib + 0.1 * max(0.0, t - 120.0) for t, mib in zip(series.t_s, series.mib, strict=True)]
+    series.mib = series.used_mib = [140.0 + 0.1 * max(0.0, t - 120.0) for t in series.t_s]
     result = judge("optimizer-0", series, SECONDS, HITS)
     assert (result.death_mib, result.growth_mib) == (0.0, pytest.approx(5.9, abs=0.1))
     assert replace(soak_of(0.0), processes=[result]).failures() == ["optimizer-0 grew by 5.9 MiB in the last third"]
+
+
+def test_a_burst_after_the_last_fault_is_no_growth() -> None:
+    """Others kept ingest from working for a while: 57 MiB waited, were freed, and are kept for what comes next."""
+    series = held({})
+    series.mib = held({150.0: 57.0}).mib
+    assert judge("ingest-0", series, SECONDS, HITS).growth_mib == 0.0

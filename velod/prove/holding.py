@@ -52,7 +52,7 @@ class Lasting:
     mib: float
     files: int
     slope_mib_h: float  # of a line through the last third
-    growth_mib: float  # in the last third, by that line
+    growth_mib: float  # in the last third: of what is resident, by that line, or of what is used, whichever is less
     new_files: int  # in the last third
     death_mib: float  # kept of each worker that died (``kept_of_deaths``); NaN: too few did
     death_files: float
@@ -64,7 +64,7 @@ def judge(worker: str, series: Series, seconds: float, hits: Sequence[Hit]) -> L
     quiet = slice(int(np.searchsorted(series.t_s, quiet_s)), None)
     t_s, mib, files = series.t_s[quiet], series.mib[quiet], series.files[quiet]
     slope_mib_s = float(np.polyfit(t_s, mib, 1)[0]) if len(t_s) > 2 else math.nan
-    half = len(files) // 2
+    used_growth_mib = 2.0 * _rise(series.used_mib[quiet])  # from the middle of one half to that of the other
     seen = [hit for hit in hits if hit[0] >= series.t_s[0] + WARM_UP_S]
     return Lasting(
         worker=worker,
@@ -72,8 +72,8 @@ def judge(worker: str, series: Series, seconds: float, hits: Sequence[Hit]) -> L
         mib=series.mib[-1],
         files=series.files[-1],
         slope_mib_h=slope_mib_s * 3600.0,
-        growth_mib=slope_mib_s * (t_s[-1] - t_s[0]) if t_s else math.nan,
-        new_files=int(np.median(files[half:]) - np.median(files[:half])) if half else 0,
+        growth_mib=min(slope_mib_s * (t_s[-1] - t_s[0]), used_growth_mib) if t_s else math.nan,
+        new_files=int(_rise(files)),
         death_mib=kept_of_deaths(series.t_s, series.used_mib, seen, quiet_s),
         death_files=kept_of_deaths(series.t_s, series.files, seen, quiet_s),
     )
@@ -91,6 +91,12 @@ def kept_of_deaths(t_s: Sequence[float], held: Sequence[float], hits: Iterable[H
         if fault.startswith(KILL):
             kept.setdefault(fault, []).append(_before(next_s, t_s, held) - _before(hit_s, t_s, held))
     return max((sorted(k)[(len(k) - 1) // 2] for k in kept.values() if len(k) > 1), default=math.nan)
+
+
+def _rise(held: Sequence[float]) -> float:
+    """How much more was held in the second half than in the first, by their medians."""
+    half = len(held) // 2
+    return float(np.median(held[half:]) - np.median(held[:half])) if half else 0.0
 
 
 def _before(at_s: float, t_s: Sequence[float], held: Sequence[float]) -> float:
