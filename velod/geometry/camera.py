@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit
 
 from velod.geometry.calibration import Camera
+from velod.geometry.so3 import Row
 from velod.types import F64
 
 # Newton's method on the distortion: converged when the distorted position is reproduced to this (normalised units).
@@ -16,8 +17,6 @@ _TOLERANCE = 1e-10
 _MAX_ITERATIONS = 30
 # Where the lens squeezes the radius by more than this the model is about to fold over, and means nothing.
 _MIN_STRETCH = 0.05
-
-Row = tuple[float, float, float]
 
 
 def A_v(x: F64, y: F64, f: float) -> F64:
@@ -64,7 +63,7 @@ def motion_field_rows(x: F64, y: F64, f: float, cx: float, cy: float, n: F64) ->
     return nA, nB
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def motion_field_row(u: float, v: float, f: float, nx: float, ny: float) -> tuple[Row, Row]:
     """``motion_field_rows`` for kernels: one row of each, at (u, v) px from the principal point."""
     # Eq. 4: n^T A_v and n^T B_w of Eq. 1

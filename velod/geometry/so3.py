@@ -13,6 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from velod.types import F64
 
+Row = tuple[float, float, float]
+
 # Below this angle (rad) the closed forms give way to their series: both are then good to 1e-12 or better.
 _SMALL = 1e-2
 
@@ -107,9 +109,8 @@ def matrix_from_quaternion(q: ArrayLike) -> F64:
 
 
 @njit(cache=True, nogil=True)
-def exp_so3(w: F64, out: F64) -> None:
-    """``exp`` for kernels: the rotation matrix of the rotation vector w (3,), rad, into out (3, 3)."""
-    x, y, z = w[0], w[1], w[2]
+def exp_rows(x: float, y: float, z: float) -> tuple[Row, Row, Row]:
+    """``exp`` for kernels: the rows of the rotation matrix of the rotation vector (x, y, z), rad."""
     theta2 = x * x + y * y + z * z
     # 0.1 rad, of which an IMU's samples are less apart; the series is good to 3e-14
     if theta2 < 0.01:
@@ -119,15 +120,20 @@ def exp_so3(w: F64, out: F64) -> None:
         theta = math.sqrt(theta2)
         a = math.sin(theta) / theta
         b = (1.0 - math.cos(theta)) / theta2
-    out[0, 0] = 1.0 - b * (y * y + z * z)
-    out[0, 1] = b * x * y - a * z
-    out[0, 2] = b * x * z + a * y
-    out[1, 0] = b * x * y + a * z
-    out[1, 1] = 1.0 - b * (x * x + z * z)
-    out[1, 2] = b * y * z - a * x
-    out[2, 0] = b * x * z - a * y
-    out[2, 1] = b * y * z + a * x
-    out[2, 2] = 1.0 - b * (x * x + y * y)
+    return (
+        (1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y),
+        (b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x),
+        (b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y)),
+    )
+
+
+@njit(cache=True, nogil=True)
+def exp_so3(w: F64, out: F64) -> None:
+    """``exp_rows`` of w (3,) into out (3, 3)."""
+    row0, row1, row2 = exp_rows(w[0], w[1], w[2])
+    out[0, 0], out[0, 1], out[0, 2] = row0
+    out[1, 0], out[1, 1], out[1, 2] = row1
+    out[2, 0], out[2, 1], out[2, 2] = row2
 
 
 @njit(cache=True, nogil=True)

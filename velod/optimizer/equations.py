@@ -9,7 +9,7 @@ from numba import njit
 
 from velod.events.columns import readonly
 from velod.geometry.so3 import vee_so3
-from velod.optimizer.flow_equation import Measured, Rows, match, row_in_body
+from velod.optimizer.flow_equation import Measured, Rows, match, row_in_body, span
 from velod.optimizer.inertial import InertialMemory
 from velod.optimizer.small import median, multiply
 from velod.types import F32, F64, I64, U16, U32, DepthBatch, FlowBatch
@@ -75,19 +75,19 @@ class EquationMaker:
             flow.t_ns - late_ns, earliest_ns, self._at_flow, self._at_depth, self._t_ns,
         )  # fmt: skip
         at_flow, at_depth, t_ns = self._at_flow[:m], self._at_depth[:m], self._t_ns[:m]
-        R_LB, columns = self._R_LB[:m], [column[:m] for column in self._columns]
-        a_B, b_B, a_L, across, common, s_L = (vector[:m] for vector in self._vectors)
+        R_LB = self._R_LB[:m]
+        a_B, b_B, a_L, across, common, s_L = self._vectors[:, :m]
         w_B = common  # until it is written
         memory.write_at(t_ns, R_LB, s_L, w_B)
-        z_v, z_e, speed, sigma, translational, depth_share, row_sigma, inv_depth = columns
         _fill(
             readonly(flow.x, np.float32), readonly(flow.y, np.float32), readonly(flow.n, np.float32),
             readonly(flow.speed, np.float32), readonly(flow.sigma, np.float32), readonly(depth.inv_depth, np.float32),
             readonly(depth.sigma, np.float32), at_flow, at_depth, self._camera, self._R_CB, self._p_BC_B,
-            R_LB, s_L, w_B, z_v, z_e, speed, sigma, translational, depth_share, inv_depth, a_B, b_B, a_L, across,
+            R_LB, s_L, w_B, self._columns, self._vectors,
         )  # fmt: skip
+        z_v, z_e, speed, sigma, translational, depth_share, row_sigma, inv_depth = self._columns[:, :m]
         depth_m = 1.0 / max(median(inv_depth), MIN_INV_DEPTH) if m else 0.0
-        if m and known is not None and self._note_motion(int(t_ns.min()), memory, known):
+        if m and known is not None and self._note_motion(span(t_ns)[0], memory, known):
             _fill_common(t_ns, a_B, b_B, a_L, s_L, self._motion, known.t_ns, known.e_L, known.g_L, common)
         else:
             common[:] = 0.0
@@ -119,7 +119,7 @@ def _usable(
     return n
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _fill(
     x: F32,
     y: F32,
@@ -136,37 +136,35 @@ def _fill(
     R_LB: F64,
     s_L: F64,
     w_B: F64,
-    z_v: F64,
-    z_e: F64,
-    own_speed: F64,
-    own_sigma: F64,
-    translational: F64,
-    depth_share: F64,
-    own_inv_depth: F64,
-    a_B: F64,
-    b_B: F64,
-    a_L: F64,
-    across: F64,
+    columns: F64,
+    vectors: F64,
 ) -> None:
+    """Of ``EquationMaker.make``'s columns (8, n) and vectors (6, n, 3) the first rows, as they are named there."""
+    z_v, z_e, own_speed, own_sigma = columns[0], columns[1], columns[2], columns[3]
+    translational, depth_share, own_inv_depth = columns[4], columns[5], columns[7]
+    a_B, b_B, a_L, across = vectors[0], vectors[1], vectors[2], vectors[3]
     f, cx, cy = camera
-    turned, unused = np.empty((1, 3)), np.empty((1, 3))
     for k in range(at_flow.size):
         i, rho = at_flow[k], np.float64(inv_depth[at_depth[k]])
         u, v = np.float64(x[i]) - cx, np.float64(y[i]) - cy
         nx, ny = np.float64(n[i, 0]), np.float64(n[i, 1])
-        row_in_body(u, v, f, nx, ny, rho, R_CB, p, k, a_B, b_B)
-        row_in_body(u, v, f, -ny, nx, rho, R_CB, p, 0, turned, unused)
+        a, b = row_in_body(u, v, f, nx, ny, rho, R_CB, p)
+        turned, _ = row_in_body(u, v, f, -ny, nx, rho, R_CB, p)
         own_speed[k], own_sigma[k], own_inv_depth[k] = speed[i], sigma[i], rho
         depth_share[k] = sigma_inv[at_depth[k]] / rho
         # Eq. 4: |x_n| - n^T B w = (n^T A / Z) v
-        z_v[k] = own_speed[k] - (b_B[k, 0] * w_B[k, 0] + b_B[k, 1] * w_B[k, 1] + b_B[k, 2] * w_B[k, 2])
-        translational[k] = z_v[k]
-        z_e[k] = z_v[k]
+        z = np.float64(speed[i]) - (b[0] * w_B[k, 0] + b[1] * w_B[k, 1] + b[2] * w_B[k, 2])
+        z_v[k] = translational[k] = z
+        a_B[k, 0], a_B[k, 1], a_B[k, 2] = a
+        b_B[k, 0], b_B[k, 1], b_B[k, 2] = b
         # v_B = R_BL (s_L + e)
         for r in range(3):
-            a_L[k, r] = R_LB[k, r, 0] * a_B[k, 0] + R_LB[k, r, 1] * a_B[k, 1] + R_LB[k, r, 2] * a_B[k, 2]
-            across[k, r] = R_LB[k, r, 0] * turned[0, 0] + R_LB[k, r, 1] * turned[0, 1] + R_LB[k, r, 2] * turned[0, 2]
-            z_e[k] -= a_L[k, r] * s_L[k, r]
+            r0, r1, r2 = R_LB[k, r, 0], R_LB[k, r, 1], R_LB[k, r, 2]
+            row = r0 * a[0] + r1 * a[1] + r2 * a[2]
+            a_L[k, r] = row
+            across[k, r] = r0 * turned[0] + r1 * turned[1] + r2 * turned[2]
+            z -= row * s_L[k, r]
+        z_e[k] = z
 
 
 @njit(cache=True, nogil=True)

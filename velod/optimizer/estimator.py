@@ -312,11 +312,11 @@ class Estimator:
 
     def _frame(self, t_ns: int) -> tuple[F64, F64, F64]:
         """R_LB and the affine map from spline to body velocity at ``t_ns``: v_B = N + M spline(t)."""
-        R, s, _ = self.memory.at(np.array([t_ns]))
+        R_LB, s_L = self.memory.frame_at(t_ns)
         if self._o.spline == "velocity":
-            return R[0], np.zeros(3), np.eye(3)
-        M = np.ascontiguousarray(R[0].T)
-        return R[0], M @ s[0], M
+            return R_LB, np.zeros(3), np.eye(3)
+        M = np.ascontiguousarray(R_LB.T)
+        return R_LB, M @ s_L, M
 
     def _equations(self, flow: FlowBatch, depth: DepthBatch) -> Equations | None:
         """Of the events of which both flow and depth speak; None where they are too few."""
@@ -413,7 +413,7 @@ class Estimator:
             return
         weak_L = degeneracy.open_directions(equations.on_error, equations.measured, equations.across, fit)
         self._weak_L = weak_L
-        self.own_solution = None if len(weak_L) else (t_ns, self.memory.at(np.array([t_ns]))[1][0], fit.e)
+        self.own_solution = None if len(weak_L) else (t_ns, self.memory.frame_at(t_ns)[1], fit.e)
         shared = self._o.shared_error
         if predicted is not None:
             innovation = self._innovation(t_ns, equations.on_error, fit, predicted, weak_L)
@@ -428,7 +428,7 @@ class Estimator:
             on_spline = overlap.counted_once(on_spline, times)
         bins = flow_equation.compress(on_spline, equations.common, fit, shared, self._slope())
         if not len(weak_L) and predicted is not None and self.head is not None:
-            R_LB = self.memory.at(np.array([t_ns]))[0][0]
+            R_LB, _ = self.memory.frame_at(t_ns)
             cov_e = R_LB @ predicted[1] @ R_LB.T
             self.rotation_check.add(bins, self._slope(), t_ns, self.head.e_at(t_ns), cov_e)
         if len(weak_L):
@@ -484,11 +484,12 @@ class Estimator:
         """
         if len(weak_L) == 3:
             return 3.0
-        R, s_L, _ = self.memory.at(np.array([t_ns]))
-        d = s_L[0] + fit.e - R[0] @ predicted[0]
-        seen_s = max(int(rows.t_ns.max() - rows.t_ns.min()), BIN_NS) * 1e-9
+        R_LB, s_L = self.memory.frame_at(t_ns)
+        d = s_L + fit.e - R_LB @ predicted[0]
+        start_ns, end_ns = flow_equation.span(rows.t_ns)
+        seen_s = max(end_ns - start_ns, BIN_NS) * 1e-9
         turned = flow_equation.turn_sensitivity(rows, fit) * self._imu.gyro_noise
-        S = fit.cov * self._o.shared_error + turned @ turned.T / seen_s + R[0] @ predicted[1] @ R[0].T
+        S = fit.cov * self._o.shared_error + turned @ turned.T / seen_s + R_LB @ predicted[1] @ R_LB.T
         if len(weak_L):
             seen = degeneracy.complement(weak_L)
             d, S = seen @ d, seen @ S @ seen.T
@@ -497,10 +498,10 @@ class Estimator:
     def _keep_error_small(self) -> None:
         """Take from s_L what gravity has added to it, before the solution loses digits to it."""
         if self._o.spline == "error" and self.head is not None:
-            _, s_L, _ = self.memory.at(np.array([self.head.t_ns]))
-            if np.linalg.norm(s_L[0]) > MAX_INTEGRATED:
-                self.memory.shift(-s_L[0])
-                self._shift(s_L[0], np.zeros(3))
+            _, s_L = self.memory.frame_at(self.head.t_ns)
+            if s_L @ s_L > MAX_INTEGRATED**2:
+                self.memory.shift(-s_L)
+                self._shift(s_L, np.zeros(3))
 
     def _shift(self, offset_L: F64, common: F64) -> None:
         """Count e and the common errors from another origin: + offset (3,), + ``common`` (3,)."""
@@ -526,7 +527,7 @@ class Estimator:
         cov[:3] = M @ cov[:3]
         cov[:, :3] = cov[:, :3] @ M.T
         v_B = N + M @ x[:3]
-        e_L = x[:3] if self._o.spline == "error" else R_LB @ v_B - self.memory.at(np.array([t_ns]))[1][0]
+        e_L = x[:3] if self._o.spline == "error" else R_LB @ v_B - self.memory.frame_at(t_ns)[1]
         self.head = Head(
             t_ns, v_B, x[3:6], x[6:9], x[9:12], R_LB, cov[:12, :12].copy(), x[12:], cov[12:, 12:].copy(), e_L
         )

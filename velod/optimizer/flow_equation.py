@@ -17,7 +17,9 @@ import numpy as np
 from numba import njit
 
 from velod.events.columns import readonly
+from velod.events.plane_fit import ANY_ORDER
 from velod.geometry.camera import motion_field_row
+from velod.geometry.so3 import Row
 from velod.optimizer.small import median
 from velod.types import F32, F64, I64, U16
 
@@ -30,6 +32,10 @@ PREDICTED_SHARE = (0.3, 3.0)
 COMMON = ("flow scale", "delay", "depth scale")
 """What all flows of a moment have wrong in common: speeds too large by a share, stamps too late by so many seconds,
 inverse depths too large by a share. They last: the window estimates them beside the velocity."""
+SEEDS = 0x7FFFFFFF
+"""Bits of a seed that count."""
+CHUNK = 64
+"""Rows after which a minimal sample that is worse than the best so far is given up."""
 MODEL_SIGMA_PX_S = 2.0
 """Flow error that neither fit nor depth accounts for (DESIGN 5.5)."""
 
@@ -88,10 +94,9 @@ class Bins:
 
         Each speaks of e at its mean time; ``slope`` (3,), m/s^2, of e takes both to that of the sum.
         """
-        start, stop = max(self.first, other.first), min(stop, self.first + self.count, other.first + other.count)
-        if start < stop:
-            own, its = (slice(start - bins.first, stop - bins.first) for bins in (self, other))
-            _merge(self.L[own], self.eta[own], self.total[own], other.L[its], other.eta[its], other.total[its], slope)
+        _merge(
+            self.first, self.L, self.eta, self.total, other.first, other.L, other.eta, other.total, stop, slope
+        )  # fmt: skip
 
 
 def body_rows(
@@ -148,14 +153,9 @@ def solve(rows: Rows, iterations: int, seed: int, ridge: float = 0.0) -> Fit | N
     Returns None where the rows do not determine a velocity; with a ``ridge`` (RIDGE), e is 0 where they do not.
     """
     e = np.zeros(3)
-    if len(rows.z) < 3 or not _ransac(rows.a, rows.z, rows.sigma, iterations, seed & 0x7FFFFFFF, ridge, e):
+    if len(rows.z) < 3 or not _ransac(rows.a, rows.z, rows.sigma, iterations, seed & SEEDS, ridge, e):
         return None
-    return _reweighted(rows, e, ridge)
-
-
-def _reweighted(rows: Rows, start: F64, ridge: float) -> Fit | None:
-    """Redescending least squares from ``start`` (3,)."""
-    weight, e, cov, stats = np.zeros(len(rows.z)), start.copy(), np.zeros((3, 3)), np.zeros(2)
+    weight, cov, stats = np.zeros(len(rows.z)), np.zeros((3, 3)), np.zeros(2)
     if not _reweight(rows.a, rows.z, rows.sigma, ridge, weight, e, cov, stats):
         return None
     return Fit(e, cov, weight, float(stats[0]), float(stats[1]))
@@ -166,15 +166,14 @@ def solve_weighted(rows: Rows, measured: Measured, iterations: int, seed: int, r
 
     The sigmas are set in ``rows``, in place.
     """
-    residual = np.zeros_like(rows.z)
-    what = (measured.speed, measured.sigma, measured.translational, measured.depth_share, residual, rows.sigma)
-    _sigmas(*what)
-    first = solve(rows, iterations, seed, ridge)
-    if first is None:
+    m = len(rows.z)
+    weight, e, cov, stats = np.zeros(m), np.zeros(3), np.zeros((3, 3)), np.zeros(2)
+    if m < 3 or not _solve_weighted(
+        rows.a, rows.z, measured.speed, measured.sigma, measured.translational, measured.depth_share,
+        iterations, seed & SEEDS, ridge, rows.sigma, weight, e, cov, stats,
+    ):  # fmt: skip
         return None
-    _residuals(rows.z, rows.a, first.e, residual)
-    _sigmas(*what)
-    return _reweighted(rows, first.e, ridge)
+    return Fit(e, cov, weight, float(stats[0]), float(stats[1]))
 
 
 def less_known(rows: Rows, c: F64, common: F64, slope: F64, e: F64, t_ns: int) -> Rows:
@@ -201,13 +200,23 @@ def compress(rows: Rows, c: F64, fit: Fit, shared_error: float, slope: F64) -> B
     ``shared_error`` divides the information of the flows, for errors that they share within a batch. ``slope`` (3,),
     m/s^2, of e takes each row to the mean time of its bin.
     """
-    first = int(rows.t_ns.min()) // BIN_NS
-    bins = Bins(first, int(rows.t_ns.max()) // BIN_NS - first + 1)
+    start_ns, end_ns = span(rows.t_ns)
+    first = start_ns // BIN_NS
+    bins = Bins(first, end_ns // BIN_NS - first + 1)
     _compress(
         rows.t_ns, rows.z, rows.a, rows.b, c, rows.sigma, fit.weight, fit.scale**2 * shared_error,
         first, slope, bins.total, bins.L, bins.eta,
     )  # fmt: skip
     return bins
+
+
+@njit(cache=True, nogil=True)
+def span(t_ns: I64) -> tuple[int, int]:
+    """The first and the last of some times (m,), m > 0, in any order."""
+    first = last = t_ns[0]
+    for t in t_ns:
+        first, last = min(first, t), max(last, t)
+    return first, last
 
 
 @njit(cache=True, nogil=True)
@@ -225,27 +234,35 @@ def match(left: U16, right: U16, at_left: I64, at_right: I64) -> int:
     return n
 
 
-@njit(cache=True, nogil=True)
-def row_in_body(
-    u: float, v: float, f: float, nx: float, ny: float, rho: float, R_CB: F64, p: F64, k: int, a: F64, b: F64
-) -> None:
-    """Row k of a and b: n^T A rho R_CB and n^T B R_CB + p x a, at (u, v) px from the principal point (Eq. 4)."""
+@njit(cache=True, nogil=True, error_model="numpy")
+def row_in_body(u: float, v: float, f: float, nx: float, ny: float, rho: float, R_CB: F64, p: F64) -> tuple[Row, Row]:
+    """n^T A rho R_CB and n^T B R_CB + p x a, at (u, v) px from the principal point (Eq. 4)."""
     (a0, a1, a2), (b0, b1, b2) = motion_field_row(u, v, f, nx, ny)
-    for i in range(3):
-        a[k, i] = rho * (a0 * R_CB[0, i] + a1 * R_CB[1, i] + a2 * R_CB[2, i])
-        b[k, i] = b0 * R_CB[0, i] + b1 * R_CB[1, i] + b2 * R_CB[2, i]
-    b[k, 0] += p[1] * a[k, 2] - p[2] * a[k, 1]
-    b[k, 1] += p[2] * a[k, 0] - p[0] * a[k, 2]
-    b[k, 2] += p[0] * a[k, 1] - p[1] * a[k, 0]
+    a = _times(rho * a0, rho * a1, rho * a2, R_CB)
+    b = _times(b0, b1, b2, R_CB)
+    across = p[1] * a[2] - p[2] * a[1], p[2] * a[0] - p[0] * a[2], p[0] * a[1] - p[1] * a[0]
+    return a, (b[0] + across[0], b[1] + across[1], b[2] + across[2])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _times(x: float, y: float, z: float, R: F64) -> Row:
+    """The row (x, y, z) R."""
+    return (
+        x * R[0, 0] + y * R[1, 0] + z * R[2, 0],
+        x * R[0, 1] + y * R[1, 1] + z * R[2, 1],
+        x * R[0, 2] + y * R[1, 2] + z * R[2, 2],
+    )
 
 
 @njit(cache=True, nogil=True)
 def _rows_in_body(u: F64, v: F64, f: float, n: F64, inv_depth: F64, R_CB: F64, p: F64, a: F64, b: F64) -> None:
     for k in range(u.size):
-        row_in_body(u[k], v[k], f, n[k, 0], n[k, 1], inv_depth[k], R_CB, p, k, a, b)
+        a_k, b_k = row_in_body(u[k], v[k], f, n[k, 0], n[k, 1], inv_depth[k], R_CB, p)
+        a[k, 0], a[k, 1], a[k, 2] = a_k
+        b[k, 0], b[k, 1], b[k, 2] = b_k
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _sigmas(speed: F64, sigma: F64, translational: F64, depth_share: F64, residual: F64, out: F64) -> None:
     low, high = PREDICTED_SHARE
     for k in range(speed.size):
@@ -253,12 +270,6 @@ def _sigmas(speed: F64, sigma: F64, translational: F64, depth_share: F64, residu
         from_fit = sigma[k] * share
         from_depth = (translational[k] - residual[k]) * depth_share[k]
         out[k] = math.sqrt(from_fit * from_fit + MODEL_SIGMA_PX_S**2 + from_depth * from_depth)
-
-
-@njit(cache=True, nogil=True)
-def _residuals(z: F64, a: F64, e: F64, out: F64) -> None:
-    for k in range(z.size):
-        out[k] = z[k] - a[k, 0] * e[0] - a[k, 1] * e[1] - a[k, 2] * e[2]
 
 
 @njit(cache=True, nogil=True)
@@ -288,7 +299,7 @@ def _less_product(z: F64, a: F64, x: F64, out: F64) -> None:
         out[k] = z[k] - (a[k, 0] * x[k, 0] + a[k, 1] * x[k, 1] + a[k, 2] * x[k, 2])
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _compress(
     t_ns: I64,
     z: F64,
@@ -304,52 +315,82 @@ def _compress(
     L: F64,
     eta: F64,
 ) -> None:
-    row = np.empty(9)
-    for k in range(z.size):
-        if not weight[k] > 0.0:
-            continue
-        w = weight[k] / (sigma[k] * sigma[k] * variance)
-        at = t_ns[k] // BIN_NS - first
-        total[at, 0] += w
-        total[at, 1] += w * (t_ns[k] - (at + first) * BIN_NS)
-    for k in range(z.size):
-        if not weight[k] > 0.0:
-            continue
-        w = weight[k] / (sigma[k] * sigma[k] * variance)
-        at = t_ns[k] // BIN_NS - first
-        dt = (t_ns[k] - (at + first) * BIN_NS - total[at, 1] / total[at, 0]) * 1e-9
-        z_mean = z[k] - dt * (a[k, 0] * slope[0] + a[k, 1] * slope[1] + a[k, 2] * slope[2])
-        for i in range(3):
-            row[i], row[3 + i], row[6 + i] = a[k, i], -b[k, i], c[k, i]
-        for i in range(9):
-            wi = w * row[i]
-            eta[at, i] += wi * z_mean
-            for j in range(i, 9):
-                L[at, i, j] += wi * row[j]
+    by_bin, start = _by_bin(t_ns, weight, first, len(L))
+    columns, w = np.empty((10, by_bin.size)), np.empty(by_bin.size)
     for at in range(len(L)):
-        for i in range(9):
-            for j in range(i):
-                L[at, i, j] = L[at, j, i]
+        for m in range(start[at], start[at + 1]):
+            k = by_bin[m]
+            w[m] = weight[k] / (sigma[k] * sigma[k] * variance)
+            total[at, 0] += w[m]
+            total[at, 1] += w[m] * (t_ns[k] - (at + first) * BIN_NS)
+        for m in range(start[at], start[at + 1]):
+            k = by_bin[m]
+            dt = (t_ns[k] - (at + first) * BIN_NS - total[at, 1] / total[at, 0]) * 1e-9
+            for i in range(3):
+                columns[i, m], columns[3 + i, m], columns[6 + i, m] = a[k, i], -b[k, i], c[k, i]
+            columns[9, m] = z[k] - dt * (a[k, 0] * slope[0] + a[k, 1] * slope[1] + a[k, 2] * slope[2])
+        _add_normal_equations(columns, w, start[at], start[at + 1], L[at], eta[at])
 
 
 @njit(cache=True, nogil=True)
-def _merge(L, eta, total, more_L, more_eta, more_total, slope):  # type: ignore[no-untyped-def]
-    """Sum of both in the first three, each taken from its own mean time to that of the sum."""
-    for k in range(len(total)):
-        if not more_total[k, 0] > 0.0:
+def _by_bin(t_ns: I64, weight: F64, first: int, bins: int) -> tuple[I64, I64]:
+    """The rows with a weight, bin after bin, and where each bin starts among them, (bins + 1,)."""
+    start = np.zeros(bins + 1, np.int64)
+    for k in range(t_ns.size):
+        if weight[k] > 0.0:
+            start[t_ns[k] // BIN_NS - first + 1] += 1
+    for at in range(bins):
+        start[at + 1] += start[at]
+    order, free = np.empty(start[bins], np.int64), start.copy()
+    for k in range(t_ns.size):
+        if weight[k] > 0.0:
+            at = t_ns[k] // BIN_NS - first
+            order[free[at]] = k
+            free[at] += 1
+    return order, start
+
+
+@njit(cache=True, nogil=True, fastmath=ANY_ORDER)
+def _add_normal_equations(columns: F64, w: F64, start: int, stop: int, L: F64, eta: F64) -> None:
+    """L (9, 9) and eta (9,) of the rows ``start`` to ``stop`` of ``columns`` (10, m), z the last, and w (m,)."""
+    weighted = np.empty(stop - start)
+    for i in range(9):
+        column, own_w = columns[i, start:stop], w[start:stop]
+        for k in range(weighted.size):
+            weighted[k] = own_w[k] * column[k]
+        for j in range(i, 10):
+            column, s = columns[j, start:stop], 0.0
+            for k in range(weighted.size):
+                s += weighted[k] * column[k]
+            if j == 9:
+                eta[i] += s
+                continue
+            L[i, j] += s
+            if j > i:
+                L[j, i] += s
+
+
+@njit(cache=True, nogil=True)
+def _merge(first, L, eta, total, more_first, more_L, more_eta, more_total, stop, slope):  # type: ignore[no-untyped-def]
+    """Add bins from number ``more_first`` on to those from ``first`` on, each taken to the mean time of the sum."""
+    for number in range(max(first, more_first), min(stop, first + len(total), more_first + len(more_total))):
+        k, m = number - first, number - more_first
+        if not more_total[m, 0] > 0.0:
             continue
-        w, more_w = total[k, 0], more_total[k, 0]
-        t = (total[k, 1] + more_total[k, 1]) / (w + more_w)
+        w, more_w = total[k, 0], more_total[m, 0]
+        t = (total[k, 1] + more_total[m, 1]) / (w + more_w)
         dt = (t - total[k, 1] / w) * 1e-9 if w > 0.0 else 0.0
-        more_dt = (t - more_total[k, 1] / more_w) * 1e-9
+        more_dt = (t - more_total[m, 1] / more_w) * 1e-9
         for i in range(9):
             shift = more_shift = 0.0
             for j in range(3):
                 shift += L[k, i, j] * slope[j]
-                more_shift += more_L[k, i, j] * slope[j]
-            eta[k, i] += shift * dt + more_eta[k, i] + more_shift * more_dt
-        L[k] += more_L[k]
-        total[k] += more_total[k]
+                more_shift += more_L[m, i, j] * slope[j]
+            eta[k, i] += shift * dt + more_eta[m, i] + more_shift * more_dt
+            for j in range(9):
+                L[k, i, j] += more_L[m, i, j]
+        total[k, 0] += more_w
+        total[k, 1] += more_total[m, 1]
 
 
 @njit(cache=True, nogil=True)
@@ -388,13 +429,40 @@ def _scale(size: F64) -> float:
     return 1.0 if 2 * small > size.size else max(1.0, 1.4826 * median(size))
 
 
+@njit(cache=True, nogil=True, error_model="numpy")
+def _per_sigma(a: F64, z: F64, sigma: F64) -> F64:
+    """Columns (4, m) of a and z over their sigmas: what loops go along must be contiguous."""
+    out = np.empty((4, z.size))
+    for k in range(z.size):
+        w = 1.0 / sigma[k]
+        out[0, k], out[1, k], out[2, k], out[3, k] = w * a[k, 0], w * a[k, 1], w * a[k, 2], w * z[k]
+    return out
+
+
+@njit(cache=True, nogil=True, fastmath=ANY_ORDER)
+def _truncated_cost(columns: F64, x0: float, x1: float, x2: float, limit: float) -> float:
+    """Sum of the squared residuals of ``_per_sigma`` at (x0, x1, x2), each 9 at most; above ``limit`` not of all."""
+    cost = 0.0
+    for start in range(0, columns.shape[1], CHUNK):
+        a0, a1, a2, z = (
+            columns[0, start : start + CHUNK],
+            columns[1, start : start + CHUNK],
+            columns[2, start : start + CHUNK],
+            columns[3, start : start + CHUNK],
+        )
+        for k in range(z.size):
+            r = z[k] - a0[k] * x0 - a1[k] * x1 - a2[k] * x2
+            cost += min(r * r, 9.0)
+        if cost >= limit:
+            break
+    return cost
+
+
 @njit(cache=True, nogil=True)
 def _ransac(a, z, sigma, iterations, seed, ridge, best):  # type: ignore[no-untyped-def]
     """Minimal samples of Eq. 15; the truncated squared residual decides (MSAC, 3 sigma). False: none was regular."""
     m = len(z)
-    x, H, g, per_sigma = np.empty(3), np.empty((3, 3)), np.empty(3), np.empty(m)
-    for k in range(m):
-        per_sigma[k] = 1.0 / sigma[k]
+    x, H, g, columns = np.empty(3), np.empty((3, 3)), np.empty(3), _per_sigma(a, z, sigma)
     best_cost = np.inf
     state = np.uint64(seed) * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
     for _ in range(iterations):
@@ -410,52 +478,54 @@ def _ransac(a, z, sigma, iterations, seed, ridge, best):  # type: ignore[no-unty
         _regularise(H, ridge)
         if not _solve3(H, g, x):
             continue
-        cost, x0, x1, x2 = 0.0, x[0], x[1], x[2]
-        for k in range(m):
-            r = (z[k] - a[k, 0] * x0 - a[k, 1] * x1 - a[k, 2] * x2) * per_sigma[k]
-            cost += min(r * r, 9.0)
-            if cost >= best_cost:
-                break
+        cost = _truncated_cost(columns, x[0], x[1], x[2], best_cost)
         if cost < best_cost:
             best_cost = cost
             best[:] = x
     return best_cost < np.inf
 
 
+@njit(cache=True, nogil=True, fastmath=ANY_ORDER)
+def _weighted_sums(columns: F64, r: F64, cutoff: float, weight: F64, H: F64, g: F64) -> None:
+    """Tukey's weights of residuals ``r`` over sigma, 0 from ``cutoff`` on, and the normal equations with them."""
+    a0, a1, a2, z = columns[0], columns[1], columns[2], columns[3]
+    g0 = g1 = g2 = h00 = h01 = h02 = h11 = h12 = h22 = 0.0
+    for k in range(r.size):
+        u = r[k] / cutoff
+        inside = max(1.0 - u * u, 0.0)
+        w = inside * inside
+        weight[k] = w
+        w0, w1, w2 = w * a0[k], w * a1[k], w * a2[k]
+        g0 += w0 * z[k]
+        g1 += w1 * z[k]
+        g2 += w2 * z[k]
+        h00 += w0 * a0[k]
+        h01 += w0 * a1[k]
+        h02 += w0 * a2[k]
+        h11 += w1 * a1[k]
+        h12 += w1 * a2[k]
+        h22 += w2 * a2[k]
+    g[0], g[1], g[2] = g0, g1, g2
+    H[0, 0], H[0, 1], H[0, 2] = h00, h01, h02
+    H[1, 0], H[1, 1], H[1, 2] = h01, h11, h12
+    H[2, 0], H[2, 1], H[2, 2] = h02, h12, h22
+
+
 @njit(cache=True, nogil=True)
 def _reweight(a, z, sigma, ridge, weight, e, cov, stats):  # type: ignore[no-untyped-def]
     """Five rounds of Tukey's weights from ``e`` (3,) on, in place; False where the rows do not determine it."""
     m = len(z)
-    H, g, r, size, per_sigma = np.empty((3, 3)), np.empty(3), np.empty(m), np.empty(m), np.empty(m)
-    for k in range(m):
-        per_sigma[k] = 1.0 / sigma[k]
+    H, g, r, size, columns = np.empty((3, 3)), np.empty(3), np.empty(m), np.empty(m), _per_sigma(a, z, sigma)
+    a0, a1, a2, z0 = columns[0], columns[1], columns[2], columns[3]
     scale = 1.0
     for _ in range(5):
         e0, e1, e2 = e[0], e[1], e[2]
         for k in range(m):
-            r[k] = (z[k] - a[k, 0] * e0 - a[k, 1] * e1 - a[k, 2] * e2) * per_sigma[k]
+            r[k] = z0[k] - a0[k] * e0 - a1[k] * e1 - a2[k] * e2
             size[k] = abs(r[k])
         scale = _scale(size)
-        g0 = g1 = g2 = h00 = h01 = h02 = h11 = h12 = h22 = 0.0
-        for k in range(m):
-            u = r[k] / (4.685 * scale)  # Tukey's biweight, 95 % efficient
-            weight[k] = (1.0 - u * u) ** 2 if abs(u) < 1.0 else 0.0
-            w = weight[k] * per_sigma[k] * per_sigma[k]
-            a0, a1, a2 = a[k, 0], a[k, 1], a[k, 2]
-            w0, w1, w2 = w * a0, w * a1, w * a2
-            g0 += w0 * z[k]
-            g1 += w1 * z[k]
-            g2 += w2 * z[k]
-            h00 += w0 * a0
-            h01 += w0 * a1
-            h02 += w0 * a2
-            h11 += w1 * a1
-            h12 += w1 * a2
-            h22 += w2 * a2
-        g[0], g[1], g[2] = g0, g1, g2
-        H[0, 0], H[0, 1], H[0, 2] = h00, h01, h02
-        H[1, 0], H[1, 1], H[1, 2] = h01, h11, h12
-        H[2, 0], H[2, 1], H[2, 2] = h02, h12, h22
+        # Tukey's biweight, 95 % efficient
+        _weighted_sums(columns, r, 4.685 * scale, weight, H, g)
         _regularise(H, ridge)
         if not _solve3(H, g, e):
             return False
@@ -470,3 +540,20 @@ def _reweight(a, z, sigma, ridge, weight, e, cov, stats):  # type: ignore[no-unt
         inliers += weight[k] > 0.0
     stats[0], stats[1] = scale, inliers / m
     return True
+
+
+@njit(cache=True, nogil=True)
+def _solve_weighted(  # type: ignore[no-untyped-def]
+    a, z, speed, speed_sigma, translational, depth_share, iterations, seed, ridge, sigma, weight, e, cov, stats
+):
+    """``_ransac`` and ``_reweight``, and this again with the sigmas of the flow that the first solution predicts."""
+    residual = np.zeros(z.size)
+    _sigmas(speed, speed_sigma, translational, depth_share, residual, sigma)
+    if not _ransac(a, z, sigma, iterations, seed, ridge, e):
+        return False
+    if not _reweight(a, z, sigma, ridge, weight, e, cov, stats):
+        return False
+    for k in range(z.size):
+        residual[k] = z[k] - a[k, 0] * e[0] - a[k, 1] * e[1] - a[k, 2] * e[2]
+    _sigmas(speed, speed_sigma, translational, depth_share, residual, sigma)
+    return _reweight(a, z, sigma, ridge, weight, e, cov, stats)

@@ -11,7 +11,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from velod.geometry.so3 import exp_so3
+from velod.events.sae import NEVER
+from velod.geometry.so3 import exp_rows
 from velod.optimizer.spikes import ACCEL_SPIKE, GYRO_SPIKE, mend_spikes
 from velod.types import F64, I64
 
@@ -30,6 +31,7 @@ class InertialMemory:
         self._s = np.empty((capacity, 3))
         self._n = 0
         self._n_integrated = 0
+        self._asked_ns, self._answer = NEVER, (np.eye(3), np.zeros(3))
 
     @property
     def t_ns(self) -> I64:
@@ -89,6 +91,13 @@ class InertialMemory:
         self.write_at(t_ns, R, s, w)
         return R, s, w
 
+    def frame_at(self, t_ns: int) -> tuple[F64, F64]:
+        """R_LB (3, 3) and s_L (3,) at a moment within the integrated span; the last answer is remembered."""
+        if t_ns != self._asked_ns:
+            R, s, _ = self.at(np.array([t_ns]))
+            self._asked_ns, self._answer = t_ns, (R[0], s[0])
+        return self._answer
+
     def write_at(self, t_ns: I64, R: F64, s: F64, w: F64) -> None:
         """``at`` into the arrays R (m, 3, 3), s (m, 3) and w (m, 3)."""
         n = self._n_integrated
@@ -107,6 +116,7 @@ class InertialMemory:
     def shift(self, offset: F64) -> None:
         """Count s_L from another origin: s_L + offset."""
         self._s[: self._n_integrated] += offset
+        self._asked_ns = NEVER
 
     def _forget(self) -> None:
         keep_from = int(np.searchsorted(self.t_ns, self._t[self._n - 1] - self._memory_ns)) if self._n else 0
@@ -134,43 +144,54 @@ def continues(t_ns: I64, after_ns: int, gap_ns: int) -> bool:
 
 
 @njit(cache=True, nogil=True)
-def _nominal_step(a0, a1, w0, w1, b, dt, R, s, phi, E, M):  # type: ignore[no-untyped-def]
-    """R <- R Exp(int w), s <- s + int R (a - b_a), samples linear from 0 to 1; Simpson over two half steps."""
+def _nominal_step(R, s, k, a0, a1, w0, w1, dt, R_out, s_out, m):  # type: ignore[no-untyped-def]
+    """R Exp(int w) and s + int R a from row ``k`` of R and s into row ``m`` of R_out and s_out.
+
+    Specific force and angular velocity, less their biases, go linearly from 0 to 1; Simpson over two half steps.
+    """
+    h0, h1 = 0.375 * dt, 0.125 * dt
+    E0, E1, E2 = exp_rows(h0 * w0[0] + h1 * w1[0], h0 * w0[1] + h1 * w1[1], h0 * w0[2] + h1 * w1[2])
+    F0, F1, F2 = exp_rows(h1 * w0[0] + h0 * w1[0], h1 * w0[1] + h0 * w1[1], h1 * w0[2] + h0 * w1[2])
+    h = dt / 6.0
     for i in range(3):
-        s[i] += dt / 6.0 * (R[i, 0] * (a0[0] - b[0]) + R[i, 1] * (a0[1] - b[1]) + R[i, 2] * (a0[2] - b[2]))
-    for half in range(2):
-        q = 0.75 if half == 0 else 0.25
-        for i in range(3):
-            phi[i] = (q * w0[i] + (1.0 - q) * w1[i] - b[3 + i]) * (0.5 * dt)
-        exp_so3(phi, E)
-        for i in range(3):
-            for j in range(3):
-                M[i, j] = R[i, 0] * E[0, j] + R[i, 1] * E[1, j] + R[i, 2] * E[2, j]
-        for i in range(3):
-            for j in range(3):
-                R[i, j] = M[i, j]
-        weight = dt * 4.0 / 6.0 if half == 0 else dt / 6.0
-        r = 0.5 if half == 0 else 1.0
-        for i in range(3):
-            for j in range(3):
-                s[i] += weight * R[i, j] * (a0[j] + r * (a1[j] - a0[j]) - b[j])
+        r0, r1, r2 = R[k, i, 0], R[k, i, 1], R[k, i, 2]
+        total = r0 * a0[0] + r1 * a0[1] + r2 * a0[2]
+        # the middle counts four times, with half of both forces
+        m0 = r0 * E0[0] + r1 * E1[0] + r2 * E2[0]
+        m1 = r0 * E0[1] + r1 * E1[1] + r2 * E2[1]
+        m2 = r0 * E0[2] + r1 * E1[2] + r2 * E2[2]
+        total += 2.0 * (m0 * (a0[0] + a1[0]) + m1 * (a0[1] + a1[1]) + m2 * (a0[2] + a1[2]))
+        r0 = m0 * F0[0] + m1 * F1[0] + m2 * F2[0]
+        r1 = m0 * F0[1] + m1 * F1[1] + m2 * F2[1]
+        r2 = m0 * F0[2] + m1 * F1[2] + m2 * F2[2]
+        total += r0 * a1[0] + r1 * a1[1] + r2 * a1[2]
+        R_out[m, i, 0], R_out[m, i, 1], R_out[m, i, 2] = r0, r1, r2
+        s_out[m, i] = s[k, i] + h * total
 
 
 @njit(cache=True, nogil=True)
-def _integrate_nominal(t_ns, accel, gyro, bias, R_out, s_out, first, last):  # type: ignore[no-untyped-def]
-    R, s = R_out[first].copy(), s_out[first].copy()
-    phi, E, M = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
+def _less(values, k, bias, part):  # type: ignore[no-untyped-def]
+    """Row ``k`` of values less the part from column ``part`` on of that of its bias."""
+    return values[k, 0] - bias[0 + part], values[k, 1] - bias[1 + part], values[k, 2] - bias[2 + part]
+
+
+@njit(cache=True, nogil=True)
+def _between(v0, v1, share):  # type: ignore[no-untyped-def]
+    """The ``share`` of the way from v0 to v1."""
+    return v0[0] + share * (v1[0] - v0[0]), v0[1] + share * (v1[1] - v0[1]), v0[2] + share * (v1[2] - v0[2])
+
+
+@njit(cache=True, nogil=True)
+def _integrate_nominal(t_ns, accel, gyro, bias, R, s, first, last):  # type: ignore[no-untyped-def]
     for k in range(first, last):
         dt = (t_ns[k + 1] - t_ns[k]) * 1e-9
-        _nominal_step(accel[k], accel[k + 1], gyro[k], gyro[k + 1], bias[k], dt, R, s, phi, E, M)
-        R_out[k + 1], s_out[k + 1] = R, s
+        b = bias[k]
+        a0, a1 = _less(accel, k, b, 0), _less(accel, k + 1, b, 0)
+        _nominal_step(R, s, k, a0, a1, _less(gyro, k, b, 3), _less(gyro, k + 1, b, 3), dt, R, s, k + 1)
 
 
 @njit(cache=True, nogil=True)
 def _nominal_at(t_ns, accel, gyro, bias, R_at, s_at, t_query, R_out, s_out, w_out):  # type: ignore[no-untyped-def]
-    # Scratch instead of views of the rows: a view costs more than the arithmetic.
-    phi, E, M, R, s = np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
-    a0, w0, a1, w1, b = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(6)
     # the samples are found from those of the query before, which are near in general
     last = len(t_ns) - 2
     k = min(max(np.searchsorted(t_ns, t_query[0], side="right") - 1, 0), last) if len(t_query) else 0
@@ -180,16 +201,10 @@ def _nominal_at(t_ns, accel, gyro, bias, R_at, s_at, t_query, R_out, s_out, w_ou
         while k > 0 and t_ns[k] > t_query[m]:
             k -= 1
         share = (t_query[m] - t_ns[k]) / (t_ns[k + 1] - t_ns[k])
-        for i in range(3):
-            a0[i], w0[i], s[i] = accel[k, i], gyro[k, i], s_at[k, i]
-            a1[i] = a0[i] + share * (accel[k + 1, i] - a0[i])
-            w1[i] = w0[i] + share * (gyro[k + 1, i] - w0[i])
-            b[i], b[3 + i] = bias[k, i], bias[k, 3 + i]
-            for j in range(3):
-                R[i, j] = R_at[k, i, j]
+        b = bias[k]
+        a0, w0 = _less(accel, k, b, 0), _less(gyro, k, b, 3)
+        a1 = _between(a0, _less(accel, k + 1, b, 0), share)
+        w1 = _between(w0, _less(gyro, k + 1, b, 3), share)
         dt = (t_query[m] - t_ns[k]) * 1e-9
-        _nominal_step(a0, a1, w0, w1, b, dt, R, s, phi, E, M)
-        for i in range(3):
-            s_out[m, i], w_out[m, i] = s[i], w1[i]
-            for j in range(3):
-                R_out[m, i, j] = R[i, j]
+        _nominal_step(R_at, s_at, k, a0, a1, w0, w1, dt, R_out, s_out, m)
+        w_out[m, 0], w_out[m, 1], w_out[m, 2] = w1[0] + b[3], w1[1] + b[4], w1[2] + b[5]

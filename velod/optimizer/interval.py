@@ -12,7 +12,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numba import njit
 
+from velod.events.plane_fit import ANY_ORDER
 from velod.optimizer import inertial_residual
+from velod.optimizer.envelope import factorise, forward
 from velod.optimizer.flow_equation import BIN_NS, Bins
 from velod.optimizer.preintegration import Preintegration
 from velod.optimizer.spline import fill_basis
@@ -44,8 +46,9 @@ class Interval:
     information: F64 = field(default_factory=lambda: np.zeros((3, 3)))
     noise: F64 = field(init=False)  # (3, 3 bins)
     bin_s: F64 = field(init=False)  # (bins,) what the IMU says of each, s
-    _A: F64 = field(init=False)  # normal equations of the local states, then of the noises, which are eliminated
+    _A: F64 = field(init=False)  # normal equations of the noises, which are eliminated, then of the local states
     _g: F64 = field(init=False)
+    _last: I64 = field(init=False)  # the whole rows: envelope.factorise
     _folded: bool = field(init=False, default=False)
     flows: Bins = field(init=False)
 
@@ -56,7 +59,7 @@ class Interval:
         self.noise = np.zeros((3, 3 * self.flows.count))
         self.bin_s = np.zeros(self.flows.count)
         size = _LOCAL + self.noise.shape[1]
-        self._A, self._g = np.empty((size, size)), np.empty(size)
+        self._A, self._g, self._last = np.empty((size, size)), np.empty(size), np.empty(size, np.int64)
 
     def linearise(self, p: Preintegration, R_LB: F64, s_L: F64, on_error: bool, v_j: F64) -> None:
         """Take what the IMU says up to ``until``, of which ``p`` is the preintegration.
@@ -103,10 +106,10 @@ class Interval:
             _fold(
                 self.t_i, self.until, self.blocks, self.r, self.information, self.noise,
                 self.flows.first, self.flows.total, self.flows.L, self.flows.eta,
-                noise_information, knot_ns, self._A, self._g,
+                noise_information, knot_ns, self._A, self._g, self._last,
             )  # fmt: skip
             self._folded = True
-        _spread(self._A, self._g, self.t_i // knot_ns - first, H, h, end)
+        _spread(self._A, self._g, self.noise.shape[1], self.t_i // knot_ns - first, H, h, end)
 
 
 @njit(cache=True, nogil=True)
@@ -134,83 +137,74 @@ def _fold(
     knot_ns: int,
     A: F64,
     g: F64,
+    last: I64,
 ) -> None:
     A[:, :] = 0.0
     g[:] = 0.0
-    segment = t_i // knot_ns
+    last[:] = g.size
+    segment, noises = t_i // knot_ns, noise.shape[1]
     _add_imu(t_i, until, segment, knot_ns, blocks, r, information, noise, A, g)
     for k in range(len(total)):
-        n = _LOCAL + 3 * k
         for i in range(3):
-            A[n + i, n + i] += noise_information
+            A[3 * k + i, 3 * k + i] += noise_information
         if total[k, 0] > 0.0:
             t = (first_bin + k) * BIN_NS + int(total[k, 1] / total[k, 0])
-            _add_flows(t, segment, knot_ns, n, L[k], eta[k], A, g)
-    _eliminate_tail(A, g, _LOCAL)
+            _add_flows(t, segment, knot_ns, 3 * k, noises, L[k], eta[k], A, g)
+    factorise(A, last, 0, noises)
+    forward(A, last, g, 0, noises)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath=ANY_ORDER)
 def _add_imu(t_i, until, segment, knot_ns, blocks, r, information, noise, A, g):  # type: ignore[no-untyped-def]
-    J, w, row = np.zeros((3, len(g))), np.empty(4), np.empty(3)
+    J, w, noises = np.zeros((3, len(g))), np.empty(4), noise.shape[1]
+    J[:, :noises] = noise
     for at, t in ((0, t_i), (12, until)):
         k = t // knot_ns
         fill_basis((t - k * knot_ns) / knot_ns, w)
         for a in range(4):
             for i in range(3):
                 for j in range(3):
-                    J[i, 3 * (k - segment + a) + j] += w[a] * blocks[i, at + j]
-    J[:, 3 * _POINTS : 3 * _POINTS + 9] = blocks[:, 3:12]
-    J[:, _LOCAL:] = noise
+                    J[i, noises + 3 * (k - segment + a) + j] += w[a] * blocks[i, at + j]
+    J[:, noises + 3 * _POINTS : noises + 3 * _POINTS + 9] = blocks[:, 3:12]
     for a in range(len(g)):
-        for q in range(3):
-            row[q] = J[0, a] * information[0, q] + J[1, a] * information[1, q] + J[2, a] * information[2, q]
-        g[a] += row[0] * r[0] + row[1] * r[1] + row[2] * r[2]
-        for b in range(a, len(g)):
-            A[a, b] += row[0] * J[0, b] + row[1] * J[1, b] + row[2] * J[2, b]
+        if J[0, a] == 0.0 and J[1, a] == 0.0 and J[2, a] == 0.0:
+            continue
+        f0 = J[0, a] * information[0, 0] + J[1, a] * information[1, 0] + J[2, a] * information[2, 0]
+        f1 = J[0, a] * information[0, 1] + J[1, a] * information[1, 1] + J[2, a] * information[2, 1]
+        f2 = J[0, a] * information[0, 2] + J[1, a] * information[1, 2] + J[2, a] * information[2, 2]
+        g[a] += f0 * r[0] + f1 * r[1] + f2 * r[2]
+        row, j0, j1, j2 = A[a, a:], J[0, a:], J[1, a:], J[2, a:]
+        for b in range(row.size):
+            row[b] += f0 * j0[b] + f1 * j1[b] + f2 * j2[b]
 
 
 @njit(cache=True, nogil=True)
-def _add_flows(t, segment, knot_ns, n, L, eta, A, g):  # type: ignore[no-untyped-def]
+def _add_flows(t, segment, knot_ns, n, noises, L, eta, A, g):  # type: ignore[no-untyped-def]
     """L (9, 9) and eta (9,) of [spline(t), b_w, common], in which the noise ``n`` enters as b_w does."""
     k = t // knot_ns
-    own = 3 * _POINTS + _OWN * (k - segment)
+    own = noises + 3 * _POINTS + _OWN * (k - segment)
     w, column, part = np.ones(7), np.empty(7, np.int64), np.empty(7, np.int64)
-    fill_basis((t - k * knot_ns) / knot_ns, w[:4])
+    fill_basis((t - k * knot_ns) / knot_ns, w[1:5])
+    column[0], part[0] = n, 3
     for a in range(4):
-        column[a], part[a] = 3 * (k - segment + a), 0
-    column[4], part[4] = own + 3, 3
-    column[5], part[5] = own + 9, 6
-    column[6], part[6] = n, 3
+        column[1 + a], part[1 + a] = noises + 3 * (k - segment + a), 0
+    column[5], part[5] = own + 3, 3
+    column[6], part[6] = own + 9, 6
+    # columns ascend: what is not on the diagonal is above it
     for a in range(7):
         for i in range(3):
-            g[column[a] + i] += w[a] * eta[part[a] + i]
-            for b in range(a, 7):
+            at, row = column[a] + i, part[a] + i
+            g[at] += w[a] * eta[row]
+            for j in range(i, 3):
+                A[at, column[a] + j] += w[a] * w[a] * L[row, part[a] + j]
+            for b in range(a + 1, 7):
                 for j in range(3):
-                    if column[b] + j >= column[a] + i:
-                        A[column[a] + i, column[b] + j] += w[a] * w[b] * L[part[a] + i, part[b] + j]
+                    A[at, column[b] + j] += w[a] * w[b] * L[row, part[b] + j]
 
 
 @njit(cache=True, nogil=True)
-def _eliminate_tail(A, g, kept):  # type: ignore[no-untyped-def]
-    """Schur complement of the states from ``kept`` on; A is its upper triangle."""
-    column = np.empty(len(g))
-    for p in range(len(g) - 1, kept - 1, -1):
-        # contiguous, as the inner loop goes along it
-        for i in range(p):
-            column[i] = A[i, p]
-        for i in range(p):
-            if column[i] == 0.0:
-                continue
-            f = column[i] / A[p, p]
-            g[i] -= f * g[p]
-            row = A[i]
-            for j in range(i, p):
-                row[j] -= f * column[j]
-
-
-@njit(cache=True, nogil=True)
-def _spread(A, g, k, H, h, end):  # type: ignore[no-untyped-def]
-    """Add the local states to those of the window; the interval begins in its ``k``-th segment."""
+def _spread(A, g, noises, k, H, h, end):  # type: ignore[no-untyped-def]
+    """Add the local states, after the noises, to those of the window; the interval begins in its ``k``-th segment."""
     columns = np.empty(_LOCAL, np.int64)
     for a in range(_POINTS):
         start = HEAD + BLOCK * (k + a - 3) if k + a >= 3 else 3 * (k + a)
@@ -221,17 +215,17 @@ def _spread(A, g, k, H, h, end):  # type: ignore[no-untyped-def]
             columns[3 * _POINTS + _OWN * b + i] = HEAD + BLOCK * (k + b) + 3 + i
     reach = 0
     for a in range(_LOCAL):
-        if A[a, a] != 0.0:
+        if A[noises + a, noises + a] != 0.0:
             reach = max(reach, columns[a] + 1)
     for a in range(_LOCAL):
-        if A[a, a] == 0.0:
+        row, i = A[noises + a, noises:], columns[a]
+        if row[a] == 0.0:
             continue
-        i = columns[a]
-        h[i] += g[a]
+        h[i] += g[noises + a]
         end[i] = max(end[i], reach)
         for b in range(a, _LOCAL):
-            if A[a, b] != 0.0:
+            if row[b] != 0.0:
                 j = columns[b]
-                H[i, j] += A[a, b]
+                H[i, j] += row[b]
                 if i != j:
-                    H[j, i] += A[a, b]
+                    H[j, i] += row[b]

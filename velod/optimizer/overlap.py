@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numba import njit
 
 from velod.config import IngestSettings
 from velod.optimizer.flow_equation import Rows
@@ -21,8 +22,9 @@ def times_seen(speed: F64, ingest: IngestSettings) -> F64:
 
     Counted in batches of ``period_ms``: those that close sooner, by count, hold fast edges with errors of their own.
     """
-    in_patch_s = np.minimum(WIDE / np.abs(speed), ingest.memory_ms * 1e-3)
-    return np.asarray(np.maximum(in_patch_s / (ingest.period_ms * 1e-3), 1.0))
+    times = np.empty_like(speed)
+    _times_seen(speed, ingest.memory_ms * 1e-3, ingest.period_ms * 1e-3, times)
+    return times
 
 
 def counted_once(rows: Rows, times: F64) -> Rows:
@@ -31,3 +33,10 @@ def counted_once(rows: Rows, times: F64) -> Rows:
     A batch by itself is as good as it is: what is judged or weighted within it has the sigmas that it had.
     """
     return replace(rows, sigma=rows.sigma * np.sqrt(times))
+
+
+@njit(cache=True, nogil=True)
+def _times_seen(speed: F64, memory_s: float, period_s: float, out: F64) -> None:
+    for k in range(speed.size):
+        in_patch_s = WIDE / abs(speed[k]) if abs(speed[k]) * memory_s > WIDE else memory_s
+        out[k] = max(in_patch_s / period_s, 1.0)

@@ -117,40 +117,34 @@ def _half_step(R, jt, phi, h, E, J, tmp):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _grow_covariance(cov, R0, a, phi, dt, var_a, var_w, F, tmp6, E, J):  # type: ignore[no-untyped-def]
-    """One step of the covariance of [dtheta, dbeta]: cov <- F cov F^T + noise."""
+def _grow_covariance(cov, R0, a, phi, dt, var_a, var_w, E, J, C, M, N):  # type: ignore[no-untyped-def]
+    """One step of the covariance of [dtheta, dbeta]: cov <- F cov F^T + noise, F = [E^T 0; C 1], C = -R0 [a]x dt."""
     exp_so3(phi, E)
     _right_jacobian(phi, J)
     for i in range(3):
-        c0 = R0[i, 1] * a[2] - R0[i, 2] * a[1]
-        c1 = R0[i, 2] * a[0] - R0[i, 0] * a[2]
-        c2 = R0[i, 0] * a[1] - R0[i, 1] * a[0]
-        for j in range(3):
-            F[i, j] = E[j, i]
-            F[i, 3 + j] = 0.0
-            F[3 + i, 3 + j] = 1.0 if i == j else 0.0
-        F[3 + i, 0] = -c0 * dt
-        F[3 + i, 1] = -c1 * dt
-        F[3 + i, 2] = -c2 * dt
-    for i in range(6):
-        for j in range(6):
-            s = 0.0
-            for k in range(6):
-                s += F[i, k] * cov[k, j]
-            tmp6[i, j] = s
-    for i in range(6):
-        for j in range(6):
-            s = 0.0
-            for k in range(6):
-                s += tmp6[i, k] * F[j, k]
-            cov[i, j] = s
+        C[i, 0] = -(R0[i, 1] * a[2] - R0[i, 2] * a[1]) * dt
+        C[i, 1] = -(R0[i, 2] * a[0] - R0[i, 0] * a[2]) * dt
+        C[i, 2] = -(R0[i, 0] * a[1] - R0[i, 1] * a[0]) * dt
     for i in range(3):
         for j in range(3):
-            s = 0.0
-            for k in range(3):
-                s += J[i, k] * J[j, k]
-            cov[i, j] += s * var_w * dt
+            M[i, j] = C[i, 0] * cov[0, j] + C[i, 1] * cov[1, j] + C[i, 2] * cov[2, j]
+            N[i, j] = C[i, 0] * cov[0, 3 + j] + C[i, 1] * cov[1, 3 + j] + C[i, 2] * cov[2, 3 + j]
+    for i in range(3):
+        for j in range(3):
+            cov[3 + i, 3 + j] += N[i, j] + N[j, i] + M[i, 0] * C[j, 0] + M[i, 1] * C[j, 1] + M[i, 2] * C[j, 2]
         cov[3 + i, 3 + i] += var_a * dt
+    for i in range(3):
+        for j in range(3):
+            N[i, j] = cov[i, 3 + j] + M[j, i]
+    for i in range(3):
+        for j in range(3):
+            cov[i, 3 + j] = E[0, i] * N[0, j] + E[1, i] * N[1, j] + E[2, i] * N[2, j]
+            cov[3 + j, i] = cov[i, 3 + j]
+            M[i, j] = E[0, i] * cov[0, j] + E[1, i] * cov[1, j] + E[2, i] * cov[2, j]
+    for i in range(3):
+        for j in range(3):
+            noise = (J[i, 0] * J[j, 0] + J[i, 1] * J[j, 1] + J[i, 2] * J[j, 2]) * var_w * dt
+            cov[i, j] = M[i, 0] * E[0, j] + M[i, 1] * E[1, j] + M[i, 2] * E[2, j] + noise
 
 
 @njit(cache=True, nogil=True)
@@ -167,7 +161,7 @@ def _integrate(t_ns, accel, gyro, t_i, t_j, b_a, b_w, var_a, var_w, R, beta, jt,
     w0, w1 = np.empty(3), np.empty(3)
     phi = np.empty(3)
     E, J, tmp, R0 = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    F, tmp6 = np.zeros((6, 6)), np.empty((6, 6))
+    C, M, N = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     k = np.searchsorted(t_ns, t_i, side="right") - 1
     k = min(max(k, 0), len(t_ns) - 2)
     t = t_i
@@ -183,7 +177,7 @@ def _integrate(t_ns, accel, gyro, t_i, t_j, b_a, b_w, var_a, var_w, R, beta, jt,
                 am[i] = 0.5 * (a0[i] + a1[i])
                 phi[i] = 0.5 * (w0[i] + w1[i]) * dt
             R0[:, :] = R
-            _grow_covariance(cov, R0, am, phi, dt, var_a, var_w, F, tmp6, E, J)
+            _grow_covariance(cov, R0, am, phi, dt, var_a, var_w, E, J, C, M, N)
             # Eq. 9: gamma by two half steps, beta by Simpson's rule over them
             _rotate_and_slope(R, jt, a0, dt / 6.0, beta, ja, jw)
             for i in range(3):

@@ -29,6 +29,7 @@ from velod.types import F64, NS_PER_S
 
 NEAR_NS, FAR_NS = 10_000_000, 40_000_000
 """Before and after a batch: from where to where the gyroscope is looked at."""
+AROUND_NS = np.array([-FAR_NS, -NEAR_NS, NEAR_NS, FAR_NS])
 BLOCK_NS = NS_PER_S // 4
 """Batches of so long are summed up: their scatter says how sure the result is."""
 HELD = 60
@@ -46,6 +47,8 @@ MAX_SIGMA_S = 0.7e-3
 """... if it is known this well, and cameras that are turned are not what falsifies it ..."""
 STEP_SIGMA = 0.5
 """... after which so much of that step is uncertain, since e was wrong with it."""
+FREE = np.eye(3) * 1e6
+"""Covariance of an e of which nothing is known, (m/s)^2."""
 DELAY = 3
 ROTATION = slice(4, 7)
 
@@ -114,10 +117,10 @@ class RotationCheck:
             turn = self._pending.popleft()
             if turn.t_ns - FAR_NS < memory.t_ns[0]:
                 continue
-            w_B, w_dot_B = _rates(turn.t_ns, memory)
+            R_LB, _, _ = memory.at(turn.t_ns + AROUND_NS)
             variance = self.gyro_noise**2 / turn.span_s
-            closed = self._clock.add(turn, True, variance, w_B, w_dot_B)
-            self._axes.add(turn, False, variance, w_B, w_dot_B)
+            closed = self._clock.add(turn, turn.cov_e * DISTRUST, variance, R_LB)
+            self._axes.add(turn, FREE, variance, R_LB)
             if closed and (step := self._conclude()) != 0.0:
                 return step
         return 0.0
@@ -145,16 +148,15 @@ class _Sums:
         self._blocks: deque[tuple[F64, F64]] = deque(maxlen=HELD)
         self._number = -1
 
-    def add(self, turn: _Turn, known: bool, variance: float, w_B: F64, w_dot_B: F64) -> bool:
-        """Whether a block has been completed by this batch."""
+    def add(self, turn: _Turn, cov_e: F64, variance: float, R_LB: F64) -> bool:
+        """Whether a block has been completed by this batch; ``R_LB`` (4, 3, 3): the attitudes at ``AROUND_NS``."""
         number = turn.t_ns // BLOCK_NS
         begun = number != self._number
         if begun:
             self._blocks.append((np.zeros((8, 8)), np.zeros(8)))
             self._number = number
         H, h = self._blocks[-1]
-        cov_e = turn.cov_e * DISTRUST if known else np.eye(3) * 1e6
-        _add_turn(turn.L, turn.eta, turn.e_L, cov_e, variance, w_B, w_dot_B, H, h)
+        _add_turn(turn.L, turn.eta, turn.e_L, cov_e, variance, R_LB, H, h)
         return begun and len(self._blocks) > MIN_BLOCKS
 
     def solution(self) -> tuple[F64, F64] | None:
@@ -172,22 +174,17 @@ class _Sums:
         return x, cov
 
 
-def _rates(t_ns: int, memory: InertialMemory) -> tuple[F64, F64]:
-    """Angular velocity and acceleration (3,) at ``t_ns``, from before and after."""
-    R_LB, _, _ = memory.at(t_ns + np.array([-FAR_NS, -NEAR_NS, NEAR_NS, FAR_NS]))
-    turns, seconds = np.empty((2, 3)), (FAR_NS - NEAR_NS) * 1e-9
-    _turns(R_LB, turns)
-    before, after = turns / seconds
-    return (before + after) / 2.0, (after - before) / ((FAR_NS + NEAR_NS) * 1e-9)
-
-
 @njit(cache=True, nogil=True)
-def _turns(R_LB: F64, out: F64) -> None:
-    """Rotation vectors, rad, from each even attitude of R_LB (2 m, 3, 3) to the odd one after it, out (m, 3)."""
-    R = np.empty((3, 3))
-    for k in range(len(out)):
-        multiply(R_LB[2 * k].T, R_LB[2 * k + 1], R)
-        log_so3(R, out[k])
+def _rates(R_LB: F64, w_B: F64, w_dot_B: F64) -> None:
+    """Angular velocity and acceleration (3,) in the midst of attitudes (4, 3, 3), from the turns before and after."""
+    R, before, after, seconds = np.empty((3, 3)), np.empty(3), np.empty(3), (FAR_NS - NEAR_NS) * 1e-9
+    multiply(R_LB[0].T, R_LB[1], R)
+    log_so3(R, before)
+    multiply(R_LB[2].T, R_LB[3], R)
+    log_so3(R, after)
+    for i in range(3):
+        w_B[i] = (before[i] + after[i]) / (2.0 * seconds)
+        w_dot_B[i] = (after[i] - before[i]) / (seconds * (FAR_NS + NEAR_NS) * 1e-9)
 
 
 @njit(cache=True, nogil=True)
@@ -212,10 +209,12 @@ def _sum_bins(bin_L: F64, bin_eta: F64, total: F64, first: int, slope: F64, L: F
 
 
 @njit(cache=True, nogil=True)
-def _add_turn(L: F64, eta: F64, e: F64, cov_e: F64, variance: float, w_B: F64, w_dot_B: F64, H: F64, h: F64) -> None:
+def _add_turn(L: F64, eta: F64, e: F64, cov_e: F64, variance: float, R_LB: F64, H: F64, h: F64) -> None:
     """Normal equations of b_app = J x, J = [1, w_dot, [w]x, w], with e marginalised that is known with ``cov_e``."""
     A, inverse, information, cov = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     gain, right, b, J = np.empty((3, 3)), np.empty(3), np.empty(3), np.zeros((3, 8))
+    w_B, w_dot_B = np.empty(3), np.empty(3)
+    _rates(R_LB, w_B, w_dot_B)
     invert3(cov_e, A)
     for i in range(3):
         right[i] = eta[i]

@@ -20,6 +20,7 @@ from numba import njit
 
 from velod.config import ImuSettings
 from velod.geometry.so3 import hat
+from velod.optimizer import envelope
 from velod.optimizer.flow_equation import BIN_NS
 from velod.optimizer.interval import BLOCK, HEAD, Interval
 from velod.optimizer.spline import fill_basis, locate
@@ -50,9 +51,8 @@ class Solution:
 
     def cov(self, F: F64) -> F64:
         """Covariance of F x, for F of shape (r, n)."""
-        Y = np.ascontiguousarray(F.T)
         out = np.zeros((len(F), len(F)))
-        _covariance(self._U, self._last, Y, out)
+        envelope.add_covariance(self._U, self._last, F.copy(), out)
         return out
 
 
@@ -268,7 +268,7 @@ class Window:
             self._renew_front(front)
         n, x, rest = self.size, self._x[: self.size], slice(front, self.size)
         U, last = self._U, self._last
-        _copy_envelope(self._front_H, self._front_end, front, n, U)
+        envelope.copy(self._front_H, self._front_end, front, n, U)
         last[rest] = self._front_end[rest]
         x[:front], x[rest] = self._forward[:front], self._front_h[rest]
         for interval in extra:
@@ -281,8 +281,8 @@ class Window:
             U[g, g] += np.outer(direction, direction) / sigma**2
             x[g] += direction * self._imu.gravity / sigma**2
         self._factorise(front, n)
-        _forward(U, last, x, front, n)
-        _backward(U, last, x)
+        envelope.forward(U, last, x, front, n)
+        envelope.backward(U, last, x)
         return Solution(x, U, last)
 
     def _fold(self, interval: Interval, H: F64, h: F64, end: I64) -> None:
@@ -296,18 +296,18 @@ class Window:
         """Eliminate the states before column ``front``."""
         n, rest = self.size, slice(front, self.size)
         U, last, y = self._U, self._last, self._forward
-        _copy_envelope(self._H, self._end, 0, n, U)
+        envelope.copy(self._H, self._end, 0, n, U)
         last[:n], y[:n] = self._end[:n], self._h[:n]
         self._factorise(0, front)
-        _forward(U, last, y, 0, front)
+        envelope.forward(U, last, y, 0, front)
         reach = int(last[:front].max(initial=front))
         np.maximum(last[front:reach], reach, out=last[front:reach])
         self._front_end[rest], self._front_h[rest] = last[rest], y[rest]
-        _copy_envelope(U, last, front, n, self._front_H)
+        envelope.copy(U, last, front, n, self._front_H)
         self._front = front
 
     def _factorise(self, start: int, stop: int) -> None:
-        if not _factorise(self._U, self._last, start, stop):
+        if not envelope.factorise(self._U, self._last, start, stop):
             raise np.linalg.LinAlgError("the information of the window is not positive definite")
 
     def _carry_common(self, dt: float) -> None:
@@ -366,16 +366,6 @@ def _place_spline(F: F64, k: int, u: float) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _copy_envelope(H: F64, end: I64, start: int, n: int, out: F64) -> None:
-    """The upper triangle of H from row ``start`` on; beyond the envelope zeros, up to where it may fill up."""
-    for i in range(start, n):
-        for j in range(i, end[i]):
-            out[i, j] = H[i, j]
-        for j in range(end[i], n):
-            out[i, j] = 0.0
-
-
-@njit(cache=True, nogil=True)
 def _add_factor(H: F64, h: F64, end: I64, J: F64, r: F64, information: F64) -> None:
     """H += J^T information J and h += J^T information r, over the columns of J (m, n) that are not zero."""
     m, n = J.shape
@@ -419,77 +409,3 @@ def _eliminate(H: F64, h: F64, gone: I64, reach: int) -> None:
                 H[j, i] = H[i, j]
         H[p, :] = 0.0
         H[:, p] = 0.0
-
-
-@njit(cache=True, nogil=True)
-def _factorise(U: F64, last: I64, start: int, stop: int) -> bool:
-    """H = U^T U in place, rows ``start`` to ``stop``, for the upper triangle of H in ``U``. False: not definite.
-
-    Rows before ``start`` are done; those from ``stop`` on become the Schur complement. ``last`` bounds the rows.
-    Three rows at a time: the envelope of a row is that of the block (``start`` and ``stop`` are multiples of 3), and
-    fills up with that of the rows before, so ``last`` is raised accordingly.
-    """
-    reach = 0
-    for k in range(start, stop, 3):
-        for i in range(k, k + 3):
-            reach = max(reach, last[i])
-        last[k : k + 3] = reach
-        for i in range(k, k + 3):
-            for p in range(k, i):
-                f = U[p, i]
-                for j in range(i, reach):
-                    U[i, j] -= f * U[p, j]
-            if not U[i, i] > 0.0:
-                return False
-            scale = 1.0 / math.sqrt(U[i, i])
-            for j in range(i, reach):
-                U[i, j] *= scale
-        u0, u1, u2 = U[k], U[k + 1], U[k + 2]
-        for i in range(k + 3, reach):
-            f0, f1, f2 = u0[i], u1[i], u2[i]
-            row = U[i]
-            for j in range(i, reach):
-                row[j] -= f0 * u0[j] + f1 * u1[j] + f2 * u2[j]
-    return True
-
-
-@njit(cache=True, nogil=True)
-def _forward(U: F64, last: I64, x: F64, start: int, stop: int) -> None:
-    """x <- U^-T x in place, rows ``start`` to ``stop`` of it; those after become the right side of what is left."""
-    for i in range(start, stop):
-        x[i] /= U[i, i]
-        for j in range(i + 1, last[i]):
-            x[j] -= U[i, j] * x[i]
-
-
-@njit(cache=True, nogil=True)
-def _backward(U: F64, last: I64, x: F64) -> None:
-    """x <- U^-1 x, in place."""
-    for i in range(len(x) - 1, -1, -1):
-        s = x[i]
-        for j in range(i + 1, last[i]):
-            s -= U[i, j] * x[j]
-        x[i] = s / U[i, i]
-
-
-@njit(cache=True, nogil=True)
-def _covariance(U: F64, last: I64, Y: F64, out: F64) -> None:
-    """out += F (U^T U)^-1 F^T, for Y (n, r) = F^T, which is overwritten with U^-T F^T."""
-    n, r = Y.shape
-    started = False
-    for i in range(n):
-        if not started:
-            for a in range(r):
-                started = started or Y[i, a] != 0.0
-            if not started:
-                continue
-        for a in range(r):
-            Y[i, a] /= U[i, i]
-        for j in range(i + 1, last[i]):
-            f = U[i, j]
-            for a in range(r):
-                Y[j, a] -= f * Y[i, a]
-        for a in range(r):
-            f = Y[i, a]
-            for b in range(r):
-                out[a, b] += f * Y[i, b]
