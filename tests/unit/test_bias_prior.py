@@ -56,6 +56,11 @@ def test_what_is_found_does_not_depend_on_the_prior_that_was_used():
         assert np.ptp(np.log(each), axis=0).max() < 2.0 * np.log(CHANGED)
 
 
+def test_a_covariance_that_is_none_by_rounding_leaves_the_prior_as_it_is():
+    cov, value = data(np.random.default_rng(3), 5.0)
+    assert likely_margins(value, -cov, SIGMA, WALKED, (2.0, 3.0)) == (2.0, 3.0)
+
+
 def test_data_that_say_nothing_leave_the_prior_as_it_is():
     cov, value = data(np.random.default_rng(2), 1.0, seen=100.0)
     assert max(found(cov, value)) < 1.2

@@ -7,9 +7,13 @@ gyroscope have an unknown margin each on their sigmas. It is 1 unless the data a
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+from numba import njit
 
 from velod.config import ImuSettings
+from velod.geometry.cholesky import factorise, forward
 from velod.types import F64
 
 MARGINS = np.array([1.0, 1.5, 2.2, 3.3, 5.0, 7.5, 11.0])
@@ -36,25 +40,40 @@ def likely_margins(
     ``biases`` (6,) [m/s^2, rad/s] with ``cov`` (6, 6) are the estimate that was made with ``margins``, and ``walked``
     (6,) the variance that they may have gathered since the start.
     """
-    information = np.linalg.inv(cov)
+    information = np.asarray(np.linalg.inv(cov), np.float64)
     used = (np.repeat(margins, 3) * sigma) ** 2 + walked
     tried = (_EACH * sigma) ** 2 + walked
-    # of the data and each of the priors together
-    A = information + (1.0 / tried - 1.0 / used)[:, :, None] * np.eye(6)
-    right = information @ biases
-    # the density of the data with the biases integrated out
-    log_likelihood = 0.5 * (
-        np.linalg.solve(A, np.broadcast_to(right, tried.shape)[:, :, None])[:, :, 0] @ right
-        - np.linalg.slogdet(A)[1]
-        - np.log(tried).sum(axis=1)
-    )
+    log_likelihood = np.empty(len(tried))
+    _log_likelihoods(information, information @ biases, 1.0 / tried, 1.0 / used, log_likelihood)
     log_weight = log_likelihood + _LOG_PRIOR
+    if not math.isfinite(log_weight.max()):  # a covariance that is none by rounding says nothing
+        return margins
     weight = np.exp(log_weight - log_weight.max())
     log_margins = weight @ np.log(_PAIRS) / weight.sum()
     if np.abs(log_margins - np.log(margins)).max() < np.log(CHANGED):
         return margins
     accel, gyro = np.exp(log_margins)
     return float(accel), float(gyro)
+
+
+@njit(cache=True, nogil=True)
+def _log_likelihoods(information: F64, right: F64, tried: F64, used: F64, out: F64) -> None:
+    """log of the density of the data with the biases integrated out, up to a constant, under each prior.
+
+    ``tried`` (n, 6) are the priors' inverse variances, in place of ``used`` (6,), which is part of ``information``
+    (6, 6). With A of the data and a prior together: right^T A^-1 right - log det A + log det tried, halved; NaN where
+    A is not positive.
+    """
+    A, y = np.empty_like(information), np.empty_like(right)
+    for m in range(len(tried)):
+        A[:], y[:] = information, right
+        for i in range(y.size):
+            A[i, i] += tried[m, i] - used[i]
+        factorise(A)
+        forward(A, y)
+        out[m] = 0.0
+        for i in range(y.size):
+            out[m] += 0.5 * (y[i] * y[i] + math.log(tried[m, i])) - math.log(A[i, i])
 
 
 def implausible(b_a: F64, b_w: F64, imu: ImuSettings) -> str:
