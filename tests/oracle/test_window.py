@@ -401,7 +401,7 @@ def test_the_velocity_is_carried_by_eq_10(estimator):
 
 
 def test_the_inertial_residual_closes_on_the_true_motion():
-    """Eq. 10 with beta rotated by R_WB_i: exact motion leaves no residual (DESIGN 4.1)."""
+    """Eq. 10 with beta rotated by R_WB_i: exact motion leaves no residual."""
     w_B, a_W, g_W = np.array([0.5, -2.0, 3.0]), np.array([2.0, -1.0, 4.0]), np.array([0.0, 0.0, 9.81])
     t = np.arange(31) * 1_000_000
     R_WB = [exp(w_B * ti * 1e-9) for ti in t]

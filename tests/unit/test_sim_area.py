@@ -12,8 +12,9 @@ from velod.cli.entry import main
 from velod.geometry.calibration import Camera
 from velod.sim import sequence, simulate, simulated_recording
 from velod.sim.area import AreaRenderer, finer, mean_of_squares, renderer_of
+from velod.sim.cast import rays_of
 from velod.sim.effects import SensorError
-from velod.sim.render import Renderer, rays_of
+from velod.sim.render import Renderer
 from velod.sim.scene import Scene, room
 from velod.sim.texture import COARSEST, SIZE, Texture
 from velod.types import F32, F64

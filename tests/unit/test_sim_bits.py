@@ -10,7 +10,7 @@ from pathlib import Path
 import numba.core.dispatcher
 import pytest
 
-from velod.sim import events, render, texture
+from velod.sim import cast, events, shade, texture
 from velod.sim.kernels import SAME_BITS
 
 RENDER = """
@@ -38,7 +38,7 @@ def test_views_are_the_same_to_the_bit_whether_compiled_just_now_or_before(tmp_p
     assert fresh == cached
 
 
-@pytest.mark.parametrize("module", [events, render, texture])
+@pytest.mark.parametrize("module", [events, cast, shade, texture])
 def test_no_kernel_may_round_as_llvm_sees_fit(module: object) -> None:
     kernels = [k for k in vars(module).values() if isinstance(k, numba.core.dispatcher.Dispatcher)]
     assert kernels

@@ -15,10 +15,10 @@ from velod.cli.stages import true_depth_of
 from velod.geometry.camera import distort, normalised, pixels
 from velod.io import EventColumns, open_recording
 from velod.sim import sequence, simulate
+from velod.sim.cast import rays_of
 from velod.sim.effects import BUS_BUFFER_US, HOT_HZ, Effects, Noise, Readout, SensorError
 from velod.sim.events import LOG_EPS, EventModel, EventSensor
 from velod.sim.imu import ImuModel
-from velod.sim.render import rays_of
 
 WIDTH, HEIGHT = 100, 80
 EXACT = EventModel(threshold=0.5, threshold_sigma=0.0, refractory_us=0)

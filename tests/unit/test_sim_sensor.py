@@ -9,8 +9,9 @@ from velod.geometry.calibration import Camera
 from velod.io import EventColumns
 from velod.sim.effects import Effects
 from velod.sim.events import LOG_EPS, EventModel, EventSensor, _time_order
-from velod.sim.render import Renderer, _atan2
+from velod.sim.render import Renderer
 from velod.sim.scene import Scene, corridor, room
+from velod.sim.shade import _atan2
 from velod.sim.texture import SIZE, TEXEL_M, Texture, TextureRecipe, make_texture, sample
 from velod.types import F32, F64
 

@@ -28,7 +28,7 @@ _QUICK_SEEDS = (1,)
 _SECONDS = {"spin": 3.0}
 _QUICK_SECONDS = {"spin": 0.6}
 _OTHER_SECONDS, _OTHER_QUICK_SECONDS = 10.0, 1.0
-# As long as the paper's must have been for its errors of IMU integration (DESIGN 4.14).
+# As long as the paper's must have been for its errors of IMU integration.
 _IMU_SECONDS = {"corridor": 90.0}
 _OTHER_IMU_SECONDS = 30.0
 _IMU_NOISES, _QUICK_IMU_NOISES = 100, 20

@@ -27,7 +27,7 @@ from velod.events.plane_fit import (
 from velod.geometry.rectify import Rectification
 from velod.types import F32, F64, I64, NS_PER_S, U8, U16, WIDE
 
-# Plane fits as for the flow (DESIGN recipe, step 2).
+# Plane fits as for the flow (docs/method.md).
 _REJECT_PX = 1.0
 _REJECTIONS = 2
 _MIN_NEIGHBOURS = 20

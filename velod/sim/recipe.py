@@ -10,8 +10,8 @@ from velod.geometry.calibration import Calibration, Camera
 from velod.sim.effects import Effects, SensorError
 from velod.sim.events import EventModel
 from velod.sim.imu import ImuModel
-from velod.sim.render import MAX_ROW
 from velod.sim.scene import Scene
+from velod.sim.shade import MAX_ROW
 from velod.sim.texture import TextureRecipe
 from velod.sim.trajectory import Trajectory
 

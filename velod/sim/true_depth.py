@@ -9,8 +9,8 @@ from velod.geometry.calibration import Calibration, Camera
 from velod.geometry.camera import normalised, undistort
 from velod.geometry.rectify import Rectification
 from velod.io.model import DepthTruth, Truth
+from velod.sim.cast import cast_shell_and_boxes
 from velod.sim.recipe import Sequence
-from velod.sim.render import cast_shell_and_boxes
 from velod.sim.scene import Scene
 from velod.sim.sequences import all_names, sequence
 from velod.types import F32, F64, I64
