@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -63,8 +64,7 @@ OUTCOMES = (
 """Names of the outcomes, in the order of their numbers."""
 
 
-@dataclass(frozen=True, slots=True)
-class Edges:
+class Edges(NamedTuple):
     """The planes of left events on the rectified image; NaN where there is none."""
 
     x: F64  # (n,) rectified px
@@ -107,10 +107,7 @@ def left_edges(
         rectification.left_covector,
         time_noise_s,
         np.empty(WIDE_SIZE + SIZE),
-        out.t_s,
-        out.variance_s2,
-        out.slope_x,
-        out.slope_y,
+        out,
     )
     return out
 
@@ -137,12 +134,7 @@ def refine(
         p.astype(np.int64),
         of,
         seed_px,
-        edges.x,
-        edges.y,
-        edges.t_s,
-        edges.variance_s2,
-        edges.slope_x,
-        edges.slope_y,
+        edges,
         rectification.right_covector,
         rectification.remap_right[0],
         rectification.remap_right[1],
@@ -191,20 +183,17 @@ def _refine_one(
     right: U16,
     unit_s: float,
     p: int,
-    x_left: float,
-    y_left: float,
+    edges: Edges,
+    k: int,
     seed: float,
-    t_left: float,
-    variance_left: float,
-    gx_left: float,
-    gy_left: float,
     right_covector: F32,
     map_x: F32,
     map_y: F32,
     time_noise_s: float,
     age: F64,
 ) -> tuple[int, float, float]:
-    """(outcome, disparity, its sigma) from the left plane's time, the variance of that, and rectified slope."""
+    """(outcome, disparity, its sigma) of edge ``k``, which has polarity ``p``, from the disparity ``seed`` on."""
+    x_left, y_left, gx_left, gy_left = edges.x[k], edges.y[k], edges.slope_x[k], edges.slope_y[k]
     x = x_left - seed
     for _ in range(_MAX_STEPS):
         sensor_x = _bilinear(map_x, x, y_left)
@@ -222,7 +211,7 @@ def _refine_one(
         gy_right = M[1, 0] * gx + M[1, 1] * gy
         # t_R(x + step) = t_L along the rectified row
         t_right = t0 + gx * (sensor_x - px) + gy * (sensor_y - py)
-        step = (t_left - t_right) / gx_right if gx_right != 0.0 else math.inf
+        step = (edges.t_s[k] - t_right) / gx_right if gx_right != 0.0 else math.inf
         x += step
         if not abs(x_left - x - seed) < _MAX_SHIFT_PX:
             return FAR, math.nan, math.nan
@@ -234,7 +223,7 @@ def _refine_one(
                 return SLOPES, math.nan, math.nan
             if rms_px(rms, norm * norm, time_noise_s) > _MAX_RMS_PX:
                 return RESIDUAL, math.nan, math.nan
-            variance = variance_left + honest_rms(n, rms, norm, time_noise_s) ** 2 / n
+            variance = edges.variance_s2[k] + honest_rms(n, rms, norm, time_noise_s) ** 2 / n
             return REFINED, x_left - x, INFLATION * math.sqrt(variance) / abs(gx_right)
     return FAR, math.nan, math.nan
 
@@ -249,13 +238,11 @@ def _left_edges(
     covector: F32,
     time_noise_s: float,
     age: F64,
-    t: F64,
-    variance: F64,
-    slope_x: F64,
-    slope_y: F64,
+    edges: Edges,
 ) -> None:
+    """``left_edges`` into what follows from the planes; ``age``: room."""
     for k in range(len(x)):
-        t[k] = variance[k] = slope_x[k] = slope_y[k] = math.nan
+        edges.t_s[k] = edges.variance_s2[k] = edges.slope_x[k] = edges.slope_y[k] = math.nan
         n, gx, gy, t0, rms, _qxx, _qxy, _qyy = _plane(
             left, p[k], x[k], y[k], unit_s, _MIN_NEIGHBOURS, time_noise_s, age
         )
@@ -263,10 +250,10 @@ def _left_edges(
         if n == 0 or not slope > 0.0:
             continue
         M = covector[y[k], x[k]]
-        t[k] = t0
-        variance[k] = honest_rms(n, rms, slope, time_noise_s) ** 2 / n
-        slope_x[k] = M[0, 0] * gx + M[0, 1] * gy
-        slope_y[k] = M[1, 0] * gx + M[1, 1] * gy
+        edges.t_s[k] = t0
+        edges.variance_s2[k] = honest_rms(n, rms, slope, time_noise_s) ** 2 / n
+        edges.slope_x[k] = M[0, 0] * gx + M[0, 1] * gy
+        edges.slope_y[k] = M[1, 0] * gx + M[1, 1] * gy
 
 
 @njit(cache=True, nogil=True)
@@ -276,12 +263,7 @@ def _refine(
     p: I64,
     of: I64,
     seed: F64,
-    x: F64,
-    y: F64,
-    t: F64,
-    variance: F64,
-    slope_x: F64,
-    slope_y: F64,
+    edges: Edges,
     right_covector: F32,
     map_x: F32,
     map_y: F32,
@@ -291,31 +273,18 @@ def _refine(
     disparity: F64,
     sigma_px: F64,
 ) -> None:
+    """``refine`` into the last three arguments; ``age``: room."""
     for i in range(len(of)):
         k = of[i]
         disparity[i] = sigma_px[i] = math.nan
-        slope = math.hypot(slope_x[k], slope_y[k])
+        slope = math.hypot(edges.slope_x[k], edges.slope_y[k])
         if not slope > 0.0:
             outcome[i] = NO_LEFT_PLANE
         elif not math.isfinite(seed[i]):
             outcome[i] = NO_SEED
-        elif abs(slope_x[k]) < MIN_NORMAL_X * slope:
+        elif abs(edges.slope_x[k]) < MIN_NORMAL_X * slope:
             outcome[i] = FLAT_EDGE
         else:
             outcome[i], disparity[i], sigma_px[i] = _refine_one(
-                right,
-                unit_s,
-                p[k],
-                x[k],
-                y[k],
-                seed[i],
-                t[k],
-                variance[k],
-                slope_x[k],
-                slope_y[k],
-                right_covector,
-                map_x,
-                map_y,
-                time_noise_s,
-                age,
+                right, unit_s, p[k], edges, k, seed[i], right_covector, map_x, map_y, time_noise_s, age
             )

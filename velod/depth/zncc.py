@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -27,8 +28,7 @@ CHUNK = 56
 """Disparities that are correlated at once: a constant, and of 8, so that the compiler leaves no remainder loop."""
 
 
-@dataclass(frozen=True, slots=True)
-class Surface:
+class Surface(NamedTuple):
     """A time surface (h, w) with the integral images (h + 1, w + 1) of itself and of its square."""
 
     values: F32
@@ -71,12 +71,8 @@ def match(
     out = Matches(disparity, score, second, np.empty((n, room), np.float32), np.empty(n, dtype=np.bool_))
     half = block_px // 2
     _match(
-        reference.values,
-        reference.total,
-        reference.total_of_squares,
-        mirrored_other.flat,
-        mirrored_other.total,
-        mirrored_other.total_of_squares,
+        reference,
+        mirrored_other,
         x,
         y,
         half,
@@ -189,13 +185,17 @@ def _first_at(scores: F32, least: np.float32) -> int:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _peak_offset(scores: F32, best: int) -> np.float32:
+    """From ``best`` to the top of the parabola through its score and both neighbours', px; 0 where it has none."""
+    before, at, after = scores[best - 1], scores[best], scores[best + 1]
+    curvature = before - np.float32(2.0) * at + after
+    return np.float32(0.5) * (before - after) / curvature if curvature < 0.0 else np.float32(0.0)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _match(
-    reference: F32,
-    total: F64,
-    squares: F64,
-    mirrored: F32,
-    mirrored_total: F64,
-    mirrored_squares: F64,
+    reference: Surface,
+    mirrored: Surface,
     x: I64,
     y: I64,
     half: int,
@@ -208,7 +208,8 @@ def _match(
     kept: F32,
     enclosed: NDArray[np.bool_],
 ) -> None:
-    h, w = reference.shape
+    """``match`` into the last five arguments; ``scores`` and ``row`` (2 half + 1,) are scratch."""
+    h, w = reference.values.shape
     area = (2 * half + 1) ** 2
     for k in range(x.shape[0]):
         xk, yk = int(x[k]), int(y[k])
@@ -220,29 +221,23 @@ def _match(
         # The block must lie inside at x and at x - d.
         if xk < half or xk >= w - half or yk < half or yk >= h - half:
             continue
-        sum_l = _block_sum(total, xk, yk, half)
-        var_l = _block_sum(squares, xk, yk, half) - sum_l * sum_l / area
+        sum_l = _block_sum(reference.total, xk, yk, half)
+        var_l = _block_sum(reference.total_of_squares, xk, yk, half) - sum_l * sum_l / area
         if var_l < _FLAT * area:
             continue
         xm = w - 1 - xk
         n = min(max_disparity, xk - half) + 1
         # With the usual size as a constant the sums stay in registers.
         if half == USUAL_HALF:
-            _correlate(reference, mirrored, xk, yk, xm, USUAL_HALF, sum_l / area, n, row, scores)
+            _correlate(reference.values, mirrored.flat, xk, yk, xm, USUAL_HALF, sum_l / area, n, row, scores)
         else:
-            _correlate(reference, mirrored, xk, yk, xm, half, sum_l / area, n, row, scores)
-        _normalise(scores[:n], mirrored_total, mirrored_squares, xm, yk, half, var_l)
+            _correlate(reference.values, mirrored.flat, xk, yk, xm, half, sum_l / area, n, row, scores)
+        _normalise(scores[:n], mirrored.total, mirrored.total_of_squares, xm, yk, half, var_l)
         scores[n:] = NONE
         kept[k] = scores
         score[k] = _largest(scores)
         best = _first_at(scores, score[k])
-        offset = np.float32(0.0)
-        if 0 < best < n - 1:
-            enclosed[k] = True
-            before, at, after = scores[best - 1], scores[best], scores[best + 1]
-            curvature = before - np.float32(2.0) * at + after
-            if curvature < 0.0:
-                offset = np.float32(0.5) * (before - after) / curvature
-        disparity[k] = best + offset
+        enclosed[k] = 0 < best < n - 1
+        disparity[k] = best + (_peak_offset(scores, best) if enclosed[k] else np.float32(0.0))
         scores[max(best - RIVAL_PX, 0) : best + RIVAL_PX + 1] = NONE
         second[k] = _largest(scores)

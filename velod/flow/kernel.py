@@ -75,10 +75,7 @@ def fit_flows(
             continue
         bend, slope_rms = 0.0, fit[4]
         if len(ring) > 0:
-            for j in range(SIZE):
-                wide[INNER_AT[j]] = age[j]
-            for j in range(RING):
-                wide[RING_AT[j]] = ring[i, j] * 1e-9
+            _put_around(age, ring, i, wide)
             fit, bend, slope_rms = widen_plane(fit, wide, reject_px, max_rms_px, time_noise_s)
         _, gx, gy, _, rms, _, _, _ = fit
         slope = math.sqrt(gx * gx + gy * gy)
@@ -86,11 +83,9 @@ def fit_flows(
             refused[_RMS] += 1
             continue
         r, c = y[i], x[i]
-        a, b = float(covector[r, c, 0, 0]), float(covector[r, c, 0, 1])
-        d, e = float(covector[r, c, 1, 0]), float(covector[r, c, 1, 1])
         # grad_T is a covector: it transforms by the inverse transpose of the undistortion's Jacobian.
-        tx = a * gx + b * gy
-        ty = d * gx + e * gy
+        M = (covector[r, c, 0, 0], covector[r, c, 0, 1], covector[r, c, 1, 0], covector[r, c, 1, 1])
+        tx, ty = M[0] * gx + M[1] * gy, M[2] * gx + M[3] * gy
         grad_T = math.sqrt(tx * tx + ty * ty)
         if not grad_T < math.inf:
             refused[_UNRECTIFIED] += 1
@@ -100,24 +95,34 @@ def fit_flows(
             continue
         # Eq. 6: the normal flow is grad_T / |grad_T|^2.
         nx, ny, speed = tx / grad_T, ty / grad_T, 1.0 / grad_T
-        along, turn[m] = _shares(fit, slope, bend, slope_rms, time_noise_s, a, b, d, e, nx, ny, speed)
+        along, turn[m] = _shares(fit, slope, bend, slope_rms, time_noise_s, M, nx, ny, speed)
         if benosman:
-            # Per-component reciprocal (Benosman 2014), the baseline of Table II.
-            bx = 1.0 / tx if tx != 0.0 else 0.0
-            by = 1.0 / ty if ty != 0.0 else 0.0
-            speed = math.hypot(bx, by)
-            nx, ny = bx / speed, by / speed
+            nx, ny, speed = _by_components(tx, ty)
         index[m] = i
-        flow[m, 0] = xy[r, c, 0]
-        flow[m, 1] = xy[r, c, 1]
-        flow[m, 2] = nx
-        flow[m, 3] = ny
-        flow[m, 4] = speed
-        flow[m, 5] = along * speed
+        flow[m, 0], flow[m, 1] = xy[r, c, 0], xy[r, c, 1]
+        flow[m, 2], flow[m, 3], flow[m, 4], flow[m, 5] = nx, ny, speed, along * speed
         m += 1
     if m > 0:
         _let_in_motion_along_edges(flow[:m], turn[:m])
     return m
+
+
+@njit(cache=True, nogil=True)
+def _put_around(age: F64, ring: U32, i: int, wide: F64) -> None:
+    """``wide`` (49,), s: the 7x7 of ``age`` (25,), s, with row ``i`` of ``ring`` (n, 24), ns, around it."""
+    for j in range(SIZE):
+        wide[INNER_AT[j]] = age[j]
+    for j in range(RING):
+        wide[RING_AT[j]] = ring[i, j] * 1e-9
+
+
+@njit(cache=True, nogil=True)
+def _by_components(tx: float, ty: float) -> tuple[float, float, float]:
+    """(nx, ny, speed) of the per-component reciprocal (Benosman 2014), the baseline of Table II."""
+    bx = 1.0 / tx if tx != 0.0 else 0.0
+    by = 1.0 / ty if ty != 0.0 else 0.0
+    speed = math.hypot(bx, by)
+    return bx / speed, by / speed, speed
 
 
 @njit(cache=True, nogil=True)
@@ -127,19 +132,17 @@ def _shares(
     bend: float,
     slope_rms: float,
     time_noise_s: float,
-    a: float,
-    b: float,
-    d: float,
-    e: float,
+    M: tuple[float, float, float, float],
     nx: float,
     ny: float,
     speed: float,
 ) -> tuple[float, float]:
     """Standard deviations of the slope along n and across it, as shares of it: errors of speed and direction (rad).
 
-    ((a, b), (d, e)) takes the sensor's gradients to the rectified image, where n and ``speed`` are.
+    ``M``, the rows of a 2x2 matrix, takes the sensor's gradients to the rectified image, where n and ``speed`` are.
     """
     n, _, _, _, _, qxx, qxy, qyy = fit
+    a, b, d, e = M
     sigma_t = INFLATION * honest_rms(n, slope_rms, slope, time_noise_s)
     along = math.hypot(
         speed * sigma_t * _deviation(qxx, qxy, qyy, a * nx + d * ny, b * nx + e * ny),
