@@ -273,6 +273,26 @@ def test_a_run_without_a_valid_velocity_fails_and_says_so(
     assert json.loads(out.read_text())["ave_mps"] is None
 
 
+def test_an_interrupt_while_a_command_is_loaded_is_no_traceback(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Finder:
+        def find_spec(self, name: str, *_: object) -> None:
+            if name == "velod.cli.entry":
+                signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.delitem(sys.modules, "velod.cli.entry", raising=False)
+    monkeypatch.setattr(sys, "meta_path", [Finder(), *sys.meta_path])
+    assert main(["--version"]) == 130
+    assert capsys.readouterr().err == "velod: interrupted\n"
+
+
+def test_nothing_is_loaded_before_an_interrupt_is_caught() -> None:
+    listed = "import sys; before = set(sys.modules); import velod.cli; print(*sorted(set(sys.modules) - before))"
+    loaded = subprocess.check_output([sys.executable, "-P", "-c", listed], text=True).split()
+    assert set(loaded) <= {"velod", "velod.cli", "collections", "collections.abc"}
+
+
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_an_interrupt_that_python_drops_ends_long_work_all_the_same(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from velod.cli.entry import main
+from velod.cli import main
 from velod.geometry.calibration import Camera
 from velod.sim import sequence, simulate, simulated_recording
 from velod.sim.area import AreaRenderer, finer, mean_of_squares, renderer_of

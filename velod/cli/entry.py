@@ -10,14 +10,14 @@ from io import TextIOWrapper
 
 from velod import __version__
 from velod.cli import play_commands, proof_commands, service_commands, watch_commands
-from velod.cli.exit import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE, RunFailed, interrupt_on_signals
+from velod.cli.exit import EXIT_FAILED, EXIT_USAGE, RunFailed, interrupt_on_signals
 from velod.cli.options import plain
 from velod.cli.values import require_writable
 from velod.runtime.kernel_cache import ensure_cache_directory
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; the exit code. What a user can put right is one line on stderr, never a traceback."""
+def run(argv: Sequence[str] | None = None) -> int:
+    """Run one command; the exit code. Raises KeyboardInterrupt on Ctrl-C and SIGTERM."""
     _provide_streams()
     try:
         interrupt_on_signals()
@@ -26,9 +26,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         ensure_cache_directory()
         require_writable(*(getattr(args, option, None) for option in ("json", "csv", "markdown")))
         return command(args)
-    except KeyboardInterrupt:
-        print("velod: interrupted", file=sys.stderr)
-        return EXIT_INTERRUPTED
     except BrokenPipeError:
         # The reader of the pipe (head, less) has seen enough. Python's own flush at exit must not complain again.
         sys.stdout = None

@@ -8,7 +8,6 @@ from types import FrameType
 
 EXIT_FAILED = 1  # the run went wrong, or its result is not good enough
 EXIT_USAGE = 2  # the user can put it right: a file, a setting, a port
-EXIT_INTERRUPTED = 130
 
 _interrupted = Event()
 
