@@ -8,9 +8,11 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import sys
 import time
+from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -25,9 +27,12 @@ from velod.runtime.inbox import Inbox
 from velod.runtime.measure import GapCounter, HostClocks
 from velod.runtime.session import SessionError, open_session
 from velod.runtime.stacked import Stacked
+from velod.runtime.staleness import StaleStream
 from velod.types import Velocity
 from velod.wire import Envelope, WireError, decode
 from velod.wire.topics import ALIVE, ANY_RIG, DEPTH, DONE, FLOW, VELOCITY, VELOCITY_AGAIN, Topic, key, parts
+
+log = logging.getLogger("velod.client")
 
 LOCAL = "tcp/127.0.0.1:17447"
 """Where a velod with default settings is found from its own host."""
@@ -163,11 +168,12 @@ class VelocityClient(Stacked):
     time. Reconnects by itself. Velocities older than ``max_age_s`` when they are handed out are discarded and
     counted as ``stale``, invalid ones as ``invalid``, and those of a time that was handed out already as
     ``repeated``. What a stand-by that takes over sends again, beside, fills the gap that its predecessor may have
-    left. Each has the age at which it is handed out, ``age_ms``: NaN where it cannot be known, because the
-    publisher's clock is not in step with this host's (counted as ``age.unknown``; such are not stale, whatever they
-    are). ``max_age_s = math.inf`` keeps everything, as for a replay in slow motion. ``tls/`` endpoints need
-    ``keys``, a folder with certificates; ``tcp/`` ones on other hosts have to be allowed with ``insecure``. To
-    enter it raises velod.runtime.session.SessionError: endpoint malformed, certificate of no use, TLS refused.
+    left. Where for a second all are stale, the log ``velod.client`` says so and why. Each has the age at which it is
+    handed out, ``age_ms``: NaN where it cannot be known, because the publisher's clock is not in step with this
+    host's (counted as ``age.unknown``; such are not stale, whatever they are). ``max_age_s = math.inf`` keeps
+    everything, as for a replay in slow motion. ``tls/`` endpoints need ``keys``, a folder with certificates; ``tcp/``
+    ones on other hosts have to be allowed with ``insecure``. To enter it raises velod.runtime.session.SessionError:
+    endpoint malformed, certificate of no use, TLS refused.
     """
 
     def __init__(
@@ -188,7 +194,8 @@ class VelocityClient(Stacked):
         self._valid_only = valid_only
         self._counted: dict[str, int] = {}
         self._t_ns: dict[str, int] = {}  # by rig: sensor time of the newest one handed out
-        self._clocks: dict[str, HostClocks] = {}  # by rig
+        self._clocks: defaultdict[str, HostClocks] = defaultdict(HostClocks)  # by rig
+        self._streams: defaultdict[str, StaleStream] = defaultdict(StaleStream)  # by rig
 
     def _open(self, stack: ExitStack) -> None:
         stack.enter_context(self._listener)
@@ -206,9 +213,10 @@ class VelocityClient(Stacked):
                 continue
             rig = parts(received.topic, received.key)["rig"]
             way_ms = self._way_ms(rig, received)
-            if why := self._why_not(rig, velocity, way_ms):
-                if received.topic is VELOCITY:  # nothing is lost of what was sent once more
-                    self._count(why)
+            why = self._why_not(rig, velocity, way_ms)
+            if received.topic is VELOCITY:  # nothing is lost of what was sent once more
+                self._note(rig, why, received, velocity.age_ms, way_ms)
+            if why:
                 continue
             self._t_ns[rig] = velocity.t_ns
             self.rig = rig
@@ -227,9 +235,20 @@ class VelocityClient(Stacked):
             return "repeated"
         return "invalid" if self._valid_only and not velocity.valid else ""
 
+    def _note(self, rig: str, why: str, received: Received, published_ms: float, way_ms: float) -> None:
+        """Count what is not handed out; where all of it is stale, tell so."""
+        if why:
+            self._count(why)
+        if why != "stale":
+            self._streams[rig].fresh()
+            return
+        waited_ms = (time.time_ns() - received.t_received_ns) * 1e-6
+        if cause := self._streams[rig].stale(published_ms, way_ms - waited_ms, waited_ms, time.monotonic_ns()):
+            log.warning("all velocities of %s are older than max_age_s (%g s): %s", rig, self._max_age_s, cause)
+
     def _way_ms(self, rig: str, received: Received) -> float:
         """From publication to now, when it is handed out: it may have waited in the queue. NaN: not known."""
-        clocks = self._clocks.setdefault(rig, HostClocks())
+        clocks = self._clocks[rig]
         clocks.heard(received.envelope.t_pub_ns, received.t_received_ns)
         now_ns = time.time_ns()
         return (now_ns - received.envelope.t_pub_ns) * 1e-6 if clocks.agree(now_ns) else math.nan
