@@ -32,6 +32,7 @@ EVAL_KEYS = [
     *("drift_percent", "real_time_factor", "latency_p50_ms", "latency_p99_ms", "median_mps", "rve_median_percent"),
     *("rve_p95_percent", "within_1_sigma", "within_2_sigma", "within_3_sigma"),
 ]
+EXAMPLE_RIG = str(Path(__file__).parents[2] / "examples" / "rig.yaml")
 CSV_HEADER = (
     "t_ns,vx,vy,vz,cov_xx,cov_xy,cov_xz,cov_yy,cov_yz,cov_zz,state,valid,age_ms,"
     "bridged_ms,up_x,up_y,up_z,up_sigma,frame,degenerate"
@@ -257,6 +258,19 @@ def test_checking_settings_looks_at_their_endpoints(capsys: pytest.CaptureFixtur
     (tmp_path / "velod.toml").write_text('[zenoh]\nlisten = "tcp/localhost"\n')
     error = error_of(capsys, "config", "check", str(tmp_path / "velod.toml"))
     assert error.startswith(f"{tmp_path / 'velod.toml'}: zenoh.listen: must be an endpoint")
+
+
+def test_certificates_that_are_missing_or_of_no_use_are_named(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    settings, missing = tmp_path / "velod.toml", tmp_path / "keys"
+    settings.write_text(f'[zenoh]\nport = 1\nkeys = "{missing}"\n')
+    no_folder = f"{missing}: no such folder (zenoh.keys); `velod config keys` makes certificates"
+    for argv in (["config", "check", str(settings)], ["router", "-c", str(settings)], ["echo", "-c", str(settings)]):
+        assert error_of(capsys, *argv) == no_folder
+    assert error_of(capsys, "run", "--calibration", EXAMPLE_RIG, "-c", str(settings)) == no_folder
+    without_use = error_of(capsys, "run", "--calibration", EXAMPLE_RIG, "--keys", str(tmp_path))
+    assert without_use == "--keys goes with a tls/ endpoint: zenoh.listen, or --connect"
 
 
 def test_a_run_without_a_valid_velocity_fails_and_says_so(

@@ -49,12 +49,13 @@ def init(path: str, *, force: bool) -> int:
 
 def check(path: str) -> int:
     """Say whether velod would take a settings file, and the calibration that it names."""
-    from velod.runtime.endpoints import parse
+    from velod.runtime.endpoints import parse, refuse_missing_keys
 
     settings = config.load(path)
     for name, endpoint in (("connect", settings.zenoh.connect), ("listen", settings.zenoh.listen)):
         if endpoint:
             parse(endpoint, f"{path}: zenoh.{name}")
+    refuse_missing_keys(settings.zenoh.keys)
     named = calibration_of(settings) is not None
     print(f"{path}: good" + ("" if named else "; rig.calibration is empty, and `velod run` needs one"))
     return 0

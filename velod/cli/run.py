@@ -29,6 +29,9 @@ def run(
         keys=keys or settings.zenoh.keys,
         insecure=insecure or settings.zenoh.insecure,
     )
+    asks = zenoh.config or any(end.startswith(("tls/", "quic/")) for end in (zenoh.listen, zenoh.connect))
+    if keys and not asks:
+        raise ConfigError("--keys goes with a tls/ endpoint: zenoh.listen, or --connect")
     settings = replace(settings, zenoh=zenoh)
     calibration = calibration_of(settings)
     if calibration is None and not settings.zenoh.connect:

@@ -7,6 +7,7 @@ import json
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import zenoh
@@ -53,6 +54,15 @@ def parse(endpoint: str, where: str) -> Endpoint:
     if match is None or not 1 <= int(match["port"]) <= 65535:
         raise SessionError(f"{where}: must be an endpoint such as tcp/192.168.1.5:17447, got {endpoint!r}")
     return Endpoint(match["protocol"], match["host"], int(match["port"]), match[4] or "")
+
+
+def refuse_missing_keys(folder: str) -> None:
+    """Raise SessionError where ``folder``, of certificates, is named and not there.
+
+    Also where no endpoint asks for one: who names it believes that it guards something.
+    """
+    if folder and not Path(folder).is_dir():
+        raise SessionError(f"{folder}: no such folder (zenoh.keys); `velod config keys` makes certificates")
 
 
 def is_loopback(host: str) -> bool:

@@ -21,7 +21,7 @@ import zenoh
 
 from velod.config import ZenohSettings
 from velod.runtime.access import SERVER, access_control, size_limits
-from velod.runtime.endpoints import ANY_HOST, Endpoint, SessionError, parse, refuse_what_is_open
+from velod.runtime.endpoints import ANY_HOST, Endpoint, SessionError, parse, refuse_missing_keys, refuse_what_is_open
 from velod.runtime.key_paths import KeyPaths
 from velod.runtime.links import keep_from_blocking
 from velod.runtime.pools import POOL_BYTES
@@ -51,6 +51,7 @@ def open_session(settings: ZenohSettings, introducer: bool = False, rigs: Sequen
 
 def open_config(config: zenoh.Config, settings: ZenohSettings, introducer: bool = False) -> zenoh.Session:
     """Open a session with a configuration that was made from ``settings``. Raises SessionError."""
+    refuse_missing_keys(settings.keys)
     try:
         session = zenoh.open(config)
     except zenoh.ZError as e:
