@@ -25,7 +25,7 @@ from velod.config import Settings
 from velod.io import Chunking, Recording, open_recording
 
 if TYPE_CHECKING:
-    from velod.runtime.online import Published
+    from velod.runtime.online import OnlineResult, Published
     from velod.sim import Sequence
 
 
@@ -121,14 +121,9 @@ def _play_online(settings: Settings, recording: Recording, options: PlayOptions)
     from velod.runtime.player import player_command
     from velod.runtime.worker import stop_on_signals
 
-    lossless = math.isinf(options.speed)
-    if lossless:
-        settings = replace(
-            settings,
-            optimizer=replace(settings.optimizer, max_wait_ms=math.inf),
-            zenoh=replace(settings.zenoh, lossless=True),
-        )
-    speed = None if lossless else options.speed
+    speed = None if math.isinf(options.speed) else options.speed
+    if speed is None:
+        settings = _lossless(settings)
     driver = player_command(
         str(recording.path), settings.zenoh, settings.rig.name, speed, options.packets, settings.rig.calibration
     )
@@ -147,6 +142,16 @@ def _play_online(settings: Settings, recording: Recording, options: PlayOptions)
         live.line.finish()
     if stop.is_set():
         raise KeyboardInterrupt
+    return _played_online(recording, result)
+
+
+def _lossless(settings: Settings) -> Settings:
+    """Wait for whatever is slow, and lose nothing."""
+    optimizer, zenoh = replace(settings.optimizer, max_wait_ms=math.inf), replace(settings.zenoh, lossless=True)
+    return replace(settings, optimizer=optimizer, zenoh=zenoh)
+
+
+def _played_online(recording: Recording, result: OnlineResult) -> Played:
     p50_ms, p99_ms = result.latency_percentiles_ms() or (None, None)
     return Played(
         recording,

@@ -85,36 +85,41 @@ def _add_eval(commands: Commands) -> None:
     parser.add_argument("files", nargs="*", metavar="FILE", help="recordings that hold the truth")
     _add_play_options(parser)
     parser.add_argument("--json", metavar="OUT", help="write the results; - for stdout")
-    parser.add_argument("--plot", metavar="DIR", help="write pictures")
     parser.add_argument(
-        "--floor", action="store_true", help="also what perfect flow and depth would give (simulated recordings only)"
+        "--report", metavar="DIR", help="compare with the baselines, offline; write report.html and pictures"
     )
     parser.add_argument(
+        "--markdown", metavar="FILE", help="put the tables into a Markdown file, between its marks for this command"
+    )
+    _add_file_options(parser)
+    _add_table_options(parser)
+
+
+def _add_file_options(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("with recordings")
+    group.add_argument("--plot", metavar="DIR", help="write pictures")
+    group.add_argument(
+        "--floor", action="store_true", help="also what perfect flow and depth would give (simulated recordings only)"
+    )
+    group.add_argument(
+        "--stages",
+        action="store_true",
+        help="judge flow and depth alone, offline, against true motion and depth: by distance, edge direction, ...",
+    )
+
+
+def _add_table_options(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("instead of recordings")
+    group.add_argument(
         "--table",
         choices=("synthetic", "held-out"),
         help="simulate the sequences of Table I, or those that no setting was chosen on (kept), and judge velod and "
         "its baselines beside the paper; what is done is kept: a run that was cut short goes on",
     )
-    parser.add_argument(
-        "--stages",
-        action="store_true",
-        help="judge flow and depth alone, offline, against true motion and depth: by distance, edge direction, ...",
-    )
-    parser.add_argument("--quick", action="store_true", help="with --table: a second of each, one IMU noise")
-    parser.add_argument("--seed", type=seed, help="with --table: of the events' noise (default 1)")
-    parser.add_argument("--texture", type=seed, metavar="SEED", help="with --table: other leaves on walls and boxes")
-    parser.add_argument(
-        "--jobs",
-        type=count,
-        metavar="N",
-        help="with --table: processes (default: cores)",
-    )
-    parser.add_argument(
-        "--markdown", metavar="FILE", help="put the tables into a Markdown file, between its marks for this command"
-    )
-    parser.add_argument(
-        "--report", metavar="DIR", help="compare with the baselines, offline; write report.html and pictures"
-    )
+    group.add_argument("--quick", action="store_true", help="a second of each, one IMU noise")
+    group.add_argument("--seed", type=seed, help="of the events' noise (default 1)")
+    group.add_argument("--texture", type=seed, metavar="SEED", help="other leaves on walls and boxes")
+    group.add_argument("--jobs", type=count, metavar="N", help="processes (default: cores)")
 
 
 def _add_sim(commands: Commands) -> None:
