@@ -202,6 +202,11 @@ def test_a_ros_pair_gives_the_same_rig_by_directory_and_by_either_file(
         np.testing.assert_allclose(calib.T_cam_imu, GOOD.T_cam_imu, atol=1e-12)
 
 
+def test_a_folder_that_holds_no_ros_pair_is_named(tmp_path: Path) -> None:
+    with pytest.raises(CalibrationError, match=f"^{tmp_path}: a folder without the left.yaml of a ROS pair$"):
+        load_calibration(tmp_path)
+
+
 def test_a_ros_matrix_with_fewer_numbers_than_declared_is_refused(
     tmp_path: Path, ros_pair: dict[str, dict[str, Any]]
 ) -> None:

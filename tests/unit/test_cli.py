@@ -151,6 +151,7 @@ def test_the_service_beside_a_sensor_needs_a_calibration(capsys: pytest.CaptureF
 
 def test_a_malformed_endpoint_is_named(capsys: pytest.CaptureFixture[str]) -> None:
     assert "zenoh.connect" in error_of(capsys, "echo", "--connect", "rig:17447")
+    assert error_of(capsys, "relay", "--to", "rig:17447").startswith("--to: must be an endpoint")
 
 
 @pytest.mark.parametrize(
@@ -190,6 +191,7 @@ def test_a_malformed_packet_rate_is_named(capsys: pytest.CaptureFixture[str], re
         (["config", "topology", "remote", "--max-hz", "-1"], "must be zero or more"),
         (["prove", "fleet", "--hz", "0"], "must be positive"),
         (["prove", "scaling", "--workers", "0"], "must be a whole number from 1 on"),
+        (["record"], "the following arguments are required: FILE\n"),
         ([], "COMMAND"),
     ],
 )

@@ -108,6 +108,13 @@ def test_a_file_that_is_not_hdf5_says_so(tmp_path: Path) -> None:
         open_recording(tmp_path / "a.h5")
 
 
+def test_a_file_of_another_kind_is_told_what_is_read(tmp_path: Path) -> None:
+    for name, cause in (("a.raw", "neither an HDF5 file nor a folder"), ("events.txt", f"the folder {tmp_path}$")):
+        (tmp_path / name).write_text("0.0 1 2 1\n")
+        with pytest.raises(RecordingError, match=cause):
+            open_recording(tmp_path / name)
+
+
 def test_a_truncated_file_says_so(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-2000])
     with pytest.raises(RecordingError, match=r"sequence\.h5: truncated HDF5 file"):

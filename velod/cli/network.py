@@ -115,10 +115,12 @@ def relay(args: argparse.Namespace) -> int:
     from velod.cli.watch import place_of
     from velod.config import ZenohSettings
     from velod.relay import relay as run
+    from velod.runtime.endpoints import parse
     from velod.runtime.worker import start_logging, stop_on_signals
 
     if args.hz > 1000.0:
         raise ValueError(f"--hz {args.hz:g}: must be at most 1000")
+    parse(args.to, "--to")
     place = place_of(args.config, way_of(args), "consumer")
     keys = args.to_keys or place.zenoh.keys
     target = ZenohSettings(connect=args.to, keys=keys, role=args.to_role, insecure=place.zenoh.insecure)

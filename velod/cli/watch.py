@@ -16,6 +16,7 @@ from velod.cli.exit import EXIT_FAILED
 from velod.cli.report import describe_attitude, describe_velocity
 from velod.client import Listener, Received
 from velod.config import ZenohSettings
+from velod.runtime.access import RIGHTS
 from velod.runtime.dispatching import SENT
 from velod.runtime.session import introducer_endpoint, open_session
 from velod.types import Health, Velocity
@@ -24,6 +25,7 @@ from velod.wire.topics import ANY_RIG, HEALTH, ODOMETRY, ODOMETRY_RESET, TOPICS,
 _CLEAR_SCREEN = "\x1b[H\x1b[2J"
 _REFRESH_S = 1.0
 _DISCOVERY_S = 3.0
+_SILENCE_S = 3.0  # after which a user wonders
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +68,7 @@ def place_of(config: str | None, way: Way, role: str) -> Place:
 
 
 def echo(config: str | None, topic: str, way: Way, count: int | None, timeout_s: float | None) -> int:
-    """Print the messages of a topic; 1 if ``timeout_s`` passes without one."""
+    """Print the messages of a topic, and who is there where none comes; 1 if ``timeout_s`` passes without one."""
     readable = [t.name for t in TOPICS.values() if t.message is not None]
     if topic not in readable:
         raise ValueError(f"no topic {topic!r} to print; topics: {', '.join(readable)}")
@@ -74,14 +76,27 @@ def echo(config: str | None, topic: str, way: Way, count: int | None, timeout_s:
     with Listener(place.rig, (TOPICS[topic],), place.zenoh) as listener:
         printed = 0
         while count is None or printed < count:
-            received = listener.receive(math.inf if timeout_s is None else timeout_s)
+            wait_s = math.inf if timeout_s is None else timeout_s
+            received = listener.receive(min(wait_s, _SILENCE_S))
+            if received is None and wait_s > _SILENCE_S:
+                _tell_of_silence(listener, place, topic, _SILENCE_S)
+                received = listener.receive(wait_s - _SILENCE_S)
             if received is None:
-                print(f"velod: no {topic} of rig {place.rig} in {timeout_s:g} s ({place.connect})", file=sys.stderr)
+                _tell_of_silence(listener, place, topic, wait_s)
                 return EXIT_FAILED
             whose = f"{parts(TOPICS[topic], received.key)['rig']}: " if place.rig == ANY_RIG else ""
             print(f"{whose}{describe(received)}", flush=True)
             printed += 1
     return 0
+
+
+def _tell_of_silence(listener: Listener, place: Place, topic: str, seconds: float) -> None:
+    said = f"velod: no {topic} of rig {place.rig} in {seconds:g} s ({place.connect})"
+    # Behind certificates not everyone may see who is alive.
+    if not place.connect.startswith("tls/") or RIGHTS[place.zenoh.role].sees:
+        names = ", ".join(worker for _, worker in listener.alive())
+        said += f"; at work: {names}" if names else "; no process of that rig is there"
+    print(said, file=sys.stderr, flush=True)
 
 
 def reset_odometry(config: str | None, way: Way) -> int:

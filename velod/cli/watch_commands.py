@@ -89,7 +89,7 @@ def _add_record(commands: Commands) -> None:
         "                                        of a velod on another host",
     )
     parser.add_argument("file", metavar="FILE", help="*.h5: sensor streams; *.mcap: topics; must not exist yet")
-    parser.add_argument("topics", nargs="*", metavar="TOPIC", help="as for velod echo; with .mcap only")
+    parser.add_argument("topics", nargs="*", default=[], metavar="TOPIC", help="as for velod echo; with .mcap only")
     add_watch_options(parser)
     parser.add_argument("--calibration", metavar="FILE", help="to put into the file, instead of the service's own")
     parser.add_argument("--seconds", type=positive, metavar="S", help="stop after S seconds (default: never)")

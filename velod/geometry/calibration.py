@@ -121,6 +121,8 @@ def load_calibration(path: str | Path, imu_path: str | Path | None = None) -> Ca
     """
     path = Path(path)
     if path.is_dir():
+        if not (path / "left.yaml").is_file():
+            raise CalibrationError(f"{path}: a folder without the left.yaml of a ROS pair")
         path = path / "left.yaml"
     tree = _read_yaml(path)
     if imu_path is not None and "cam0" not in tree:

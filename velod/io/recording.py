@@ -6,6 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import h5py
+
 from velod.geometry.calibration import Calibration
 from velod.io import dsec, sequence, text
 from velod.io.model import EventSource, Imu, RecordingError, Truth
@@ -13,6 +15,8 @@ from velod.io.packets import Chunking, packets
 from velod.types import NS_PER_S, EventPacket, ImuPacket
 
 FORMATS = ("sequence", "dsec", "text")
+
+_HDF5_SUFFIXES = (".h5", ".hdf5")
 
 _MIN_IMU_HZ = 10.0
 """Over the whole recording. IMUs give 100 Hz and more; times in a wrong unit, or one that leaps, give nearly none."""
@@ -89,6 +93,10 @@ def open_recording(
 
 def _guess(path: Path) -> str:
     if path.is_file():
+        if path.name == "events.txt":
+            raise RecordingError(f"{path}: one file of a recording, which is the folder {path.parent}")
+        if path.suffix not in _HDF5_SUFFIXES and not h5py.is_hdf5(path):
+            raise RecordingError(f"{path}: not a recording: neither an HDF5 file nor a folder (DSEC, text)")
         return "sequence"
     if (path / "events" / "left").is_dir():
         return "dsec"
