@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from velod.runtime.access import RIGHTS, ROLES, access_control, common_name, may_read, size_limits
-from velod.wire.codec import MAX_BYTES
+from velod.wire.schema import MAX_BYTES
 from velod.wire.topics import EVENTS, FLOW, HEALTH, ODOMETRY, TOPICS, VELOCITY, key
 
 

@@ -26,7 +26,7 @@ from velod.runtime.key_paths import KeyPaths
 from velod.runtime.links import keep_from_blocking
 from velod.runtime.pools import POOL_BYTES
 from velod.runtime.relink import keep_linked, tell_of_links
-from velod.wire.codec import MAX_BYTES
+from velod.wire.schema import MAX_BYTES
 
 __all__ = ["SessionError", "introducer_endpoint", "open_session"]
 

@@ -17,6 +17,8 @@ VERSION = 1
 OFFSET = np.dtype("<u4")
 """Of the column that times are sent as."""
 INT64 = (-(2**63), 2**63 - 1)
+MAX_BYTES = 64 << 20
+"""Largest message. A 1280x720 StereoBatch has 11 MB, a second of 5 Mev/s has 45 MB."""
 MESSAGE_TYPES: dict[str, type[Any]] = {cls.__name__: cls for cls in get_args(types.Message)}
 
 
@@ -29,6 +31,11 @@ class WireError(ValueError):
     def __init__(self, reason: str, text: str) -> None:
         super().__init__(f"{reason}: {text}")
         self.reason = reason
+
+
+def short(value: Any) -> str:
+    """A value that somebody sent, for an error's text."""
+    return repr(value)[:80]
 
 
 @dataclass(frozen=True, slots=True)
