@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from velod.cli.exit import RunFailed
-from velod.cli.report import write_json
+from velod.cli.files import write_json
 from velod.config import Settings, from_tree
 from velod.eval import bench_input
 from velod.eval.bench import Result, Size, measure

@@ -11,8 +11,9 @@ from velod import __version__
 from velod.cli.cases import Outcome, SequenceJob, judge_recording
 from velod.cli.config import calibration_of, settings_of
 from velod.cli.exit import RunFailed, raise_if_interrupted
+from velod.cli.files import write_json
 from velod.cli.jobs import commit, run_jobs
-from velod.cli.report import Line, progress_bar, write_json
+from velod.cli.line import Line, progress_bar
 from velod.cli.stages import true_depth_of
 from velod.config import Settings
 from velod.eval.floor import with_perfect_flow_and_depth

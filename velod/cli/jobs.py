@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import velod
 from velod.cli.cases import Outcome, SequenceJob
 from velod.cli.exit import RunFailed, raise_if_interrupted
-from velod.cli.report import Line
+from velod.cli.line import Line
 
 if TYPE_CHECKING:
     from multiprocessing.synchronize import Event

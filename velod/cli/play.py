@@ -1,4 +1,4 @@
-"""``velod replay``, ``eval``, ``demo`` and ``sim``: recordings through the stages, and what came out."""
+"""``velod replay`` and ``eval``: recordings through the stages, and what came out."""
 
 from __future__ import annotations
 
@@ -7,26 +7,18 @@ import sys
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING
 
 from velod.cli.config import calibration_of, settings_of
-from velod.cli.exit import RunFailed, raise_if_interrupted
-from velod.cli.played import Played, has_velocity, metrics_of, result_row, shortcomings, summary
-from velod.cli.report import (
-    Line,
-    VelocityLine,
-    log_above,
-    progress_bar,
-    with_progress,
-    write_csv,
-    write_json,
-)
+from velod.cli.exit import RunFailed
+from velod.cli.files import write_csv, write_json
+from velod.cli.line import VelocityLine, log_above, with_progress
+from velod.cli.played import Played, has_velocity, metrics_of, result_row, summary
 from velod.config import Settings
 from velod.io import Chunking, Recording, open_recording
 
 if TYPE_CHECKING:
     from velod.runtime.online import OnlineResult, Published
-    from velod.sim import Sequence
 
 
 _SENSORS = ("calibration", "camera", "imu")  # first parts of the names of alarms
@@ -189,68 +181,3 @@ def _plot(played: Played, directory: str) -> None:
 
     for path in plot_run(played.velocities, played.recording.truth, directory, Path(played.recording.path).stem):
         print(f"wrote {path}", file=sys.stderr)
-
-
-# --- simulated sensors ---
-
-# What a demo must reach; corridors and boxes give 0.03 to 0.05 m/s, spins of 13 rad/s twice as much.
-_DEMO_AVE_MPS = {"corridor": 0.1, "boxes": 0.1, "spin": 0.2}
-
-
-def simulate_to_file(recipe: Sequence, path: str, seconds: float, seed: int) -> int:
-    """Record a simulated sequence. Raises RecordingError."""
-    from velod.sim import simulate
-
-    with _Bar(f"simulating {seconds:g} s of {recipe.name}") as bar:
-        simulate(recipe, seconds, seed, path, bar.show)
-    print(f"wrote {path}")
-    return 0
-
-
-def demo(config: str | None, name: str, seconds: float, seed: int, csv: str | None, json: str | None) -> int:
-    """Simulated sensors through the service. Raises RunFailed where the result is not as it should be."""
-    from velod.sim import simulated_recording
-
-    settings = settings_of(config, calibration="")  # the simulated rig brings its own
-    with _Bar(f"simulating {seconds:g} s of {name}") as bar:
-        path = simulated_recording(name, seconds, seed, bar.show)
-    print(f"{seconds:g} s of {name} in real time: a driver, ingest, flow, depth, optimizer", file=sys.stderr)
-    played = play(settings, str(path), PlayOptions())
-    metrics = metrics_of(played)
-    assert metrics is not None, "a simulated recording holds the truth"
-    if csv is not None:
-        write_csv(csv, played.velocities)
-    print(summary(played, metrics), file=sys.stderr if json == "-" else sys.stdout)
-    if json is not None:
-        write_json(json, result_row(played, metrics))
-    limit_mps = _DEMO_AVE_MPS[name.split("-")[0]]
-    if missing := shortcomings(played, metrics, settings.optimizer.output_hz, limit_mps):
-        raise RunFailed("; ".join(missing))
-    return 0
-
-
-class _Bar:
-    """A progress bar on stderr for work that tells its share; one plain line where that is no terminal.
-
-    Work that need not be done, and tells no share, is not mentioned.
-    """
-
-    def __init__(self, what: str) -> None:
-        self._what = what
-        self._line = Line()
-        self._start_s = time.monotonic()
-        self._said = False
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._line.finish()
-
-    def show(self, share: float) -> None:
-        raise_if_interrupted()
-        if not self._line.enabled and not self._said:
-            print(self._what, file=sys.stderr)
-            self._said = True
-        if self._line.due():
-            self._line.draw(f"{self._what} {progress_bar(share, time.monotonic() - self._start_s)}")

@@ -168,7 +168,7 @@ def _add_play_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _demo(args: argparse.Namespace) -> int:
-    from velod.cli.play import demo
+    from velod.cli.simulated import demo
 
     return demo(args.config, args.sequence, args.seconds, args.seed, args.csv, args.json)
 
@@ -224,8 +224,8 @@ def _require_what_goes_together(args: argparse.Namespace) -> None:
 
 
 def _sim(args: argparse.Namespace) -> int:
-    from velod.cli.play import simulate_to_file
     from velod.cli.sim import recipe_of
+    from velod.cli.simulated import simulate_to_file
 
     return simulate_to_file(recipe_of(args), args.output, args.seconds, args.seed)
 

@@ -53,7 +53,7 @@ def _out(args: argparse.Namespace) -> TextIO:
 
 def _end(args: argparse.Namespace, result: Any, failures: Sequence[str]) -> int:
     """Write the JSON. Raises RunFailed where something is not as claimed."""
-    from velod.cli.report import write_json
+    from velod.cli.files import write_json
 
     if args.json is not None:
         write_json(args.json, result)

@@ -13,7 +13,7 @@ from threading import Event
 from velod import __version__
 from velod.cli.config import calibration_of, settings_of
 from velod.cli.exit import EXIT_FAILED, RunFailed
-from velod.cli.report import Line
+from velod.cli.line import Line
 from velod.cli.values import require_writable
 from velod.cli.watch import Place, Way, place_of
 from velod.client import Listener, Received

@@ -6,7 +6,8 @@ import sys
 from collections.abc import Sequence
 
 from velod.cli.config import calibration_of, settings_of
-from velod.cli.report import with_progress, write_json
+from velod.cli.files import write_json
+from velod.cli.line import with_progress
 from velod.config import Settings
 from velod.eval.front_end import FrontEnd
 from velod.eval.scene_truth import DepthImages, SceneTruthError, TrueDepth

@@ -13,7 +13,7 @@ import numpy as np
 
 from velod.cli.config import settings_of
 from velod.cli.exit import EXIT_FAILED
-from velod.cli.report import describe_attitude, describe_velocity
+from velod.cli.words import describe_attitude, describe_velocity
 from velod.client import Listener, Received
 from velod.config import ZenohSettings
 from velod.runtime.access import RIGHTS

@@ -9,9 +9,10 @@ import time
 import numpy as np
 import pytest
 
+from velod.cli.line import Line, progress_bar
 from velod.cli.played import Played, shortcomings
-from velod.cli.report import Line, describe_velocity, progress_bar, speed_and_sigma
 from velod.cli.watch import Place, describe, losses, table
+from velod.cli.words import describe_velocity, speed_and_sigma
 from velod.client import Received
 from velod.config import ZenohSettings
 from velod.eval.metrics import Metrics
