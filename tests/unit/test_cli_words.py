@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 
 from velod.cli.line import Line, progress_bar
+from velod.cli.place import Place
 from velod.cli.played import Played, shortcomings
-from velod.cli.watch import Place, describe, losses, table
+from velod.cli.top import losses, table
+from velod.cli.watch import describe
 from velod.cli.words import describe_velocity, speed_and_sigma
 from velod.client import Received
 from velod.config import ZenohSettings

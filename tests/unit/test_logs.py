@@ -16,7 +16,7 @@ from mcap.reader import make_reader
 
 from tests import slanted_scene
 from velod.cli import record
-from velod.cli.watch import Place
+from velod.cli.place import Place
 from velod.client import Received
 from velod.config import ZenohSettings
 from velod.io import RecordingError, open_recording

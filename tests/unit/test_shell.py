@@ -16,7 +16,7 @@ import zenoh
 
 from velod.cli import watch
 from velod.cli.exit import EXIT_FAILED
-from velod.cli.watch import Way
+from velod.cli.place import Way
 from velod.client import VelocityClient
 from velod.config import Settings
 from velod.runtime.outlet import Outlet

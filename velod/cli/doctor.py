@@ -9,7 +9,7 @@ from dataclasses import asdict
 from velod.cli.config import settings_of
 from velod.cli.exit import EXIT_FAILED
 from velod.cli.files import write_json
-from velod.cli.watch import Way, place_of
+from velod.cli.place import Way, place_of
 from velod.runtime import checkup
 from velod.runtime.checkup import Finding
 

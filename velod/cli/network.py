@@ -11,7 +11,7 @@ from velod.cli.config import settings_of
 from velod.cli.values import host, not_negative, port, positive, rig_name
 
 if TYPE_CHECKING:
-    from velod.cli.watch import Way
+    from velod.cli.place import Way
 
 LOCAL = "tcp/127.0.0.1:17447"
 TOPOLOGIES = ("local", "robot", "fleet", "remote")
@@ -36,7 +36,7 @@ def add_way_options(parser: argparse.ArgumentParser) -> None:
 
 def way_of(args: argparse.Namespace) -> Way:
     """What was said of the way."""
-    from velod.cli.watch import Way
+    from velod.cli.place import Way
 
     return Way(args.connect, args.rig, args.keys, args.role, args.insecure)
 
@@ -112,7 +112,7 @@ def router(args: argparse.Namespace) -> int:
 
 def relay(args: argparse.Namespace) -> int:
     """Pass velocities on until SIGINT or SIGTERM."""
-    from velod.cli.watch import place_of
+    from velod.cli.place import place_of
     from velod.config import ZenohSettings
     from velod.relay import relay as run
     from velod.runtime.endpoints import parse

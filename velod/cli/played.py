@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from velod.cli.watch import losses
+from velod.cli.top import losses
 from velod.io import Recording
 from velod.types import Velocity
 

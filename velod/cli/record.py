@@ -14,8 +14,8 @@ from velod import __version__
 from velod.cli.config import calibration_of, settings_of
 from velod.cli.exit import EXIT_FAILED, RunFailed
 from velod.cli.line import Line
+from velod.cli.place import Place, Way, place_of
 from velod.cli.values import require_writable
-from velod.cli.watch import Place, Way, place_of
 from velod.client import Listener, Received
 from velod.geometry.calibration import Calibration, CalibrationError, save_calibration
 from velod.io.live import SensorLog

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from velod.cli.exit import EXIT_FAILED
-from velod.cli.watch import Way, place_of
+from velod.cli.place import Way, place_of
 from velod.client import Listener
 from velod.optimizer.flow_equation import pairs
 from velod.optimizer.parts import Parts, batch_seq

@@ -116,7 +116,7 @@ def _echo(args: argparse.Namespace) -> int:
 
 
 def _top(args: argparse.Namespace) -> int:
-    from velod.cli.watch import top
+    from velod.cli.top import top
 
     return top(args.config, way_of(args), once=args.once)
 
