@@ -26,6 +26,7 @@ NAMES = {
     "pipeline": ["ingest.batch", "ingest.hd", "pipeline.one_process", "pipeline.sustained", "pipeline.event_to_flow"],
     "hop": ["hop.velod", "hop.zenoh"],
     "latency": [f"latency.{leg}" for leg in LEGS],
+    "rate": ["rate.346x260", "rate.640x480", "rate.1280x720"],
 }
 PEERS = {"flow.plane_fit": 1e-3, "depth.sparse_500": 0.5, "solve.window": 1e-3, "codec.batch": 0.0}
 """How far a case may be from its peer: relative speed, px, relative information, differing fields."""
@@ -39,7 +40,9 @@ def test_all_writes_every_name_with_times_and_ratios(tmp_path: Path, capsys: pyt
     out = tmp_path / "bench.json"
     assert bench("all", str(out), TINY) == 0
     rows = json.loads(out.read_text())
-    assert [r["name"] for r in rows] == [name for group in (*GROUPS, "hop", "latency") for name in NAMES[group]]
+    assert [r["name"] for r in rows] == [
+        name for group in (*GROUPS, "hop", "latency", "rate") for name in NAMES[group]
+    ]
     table = capsys.readouterr().out
     for r in rows:
         assert r["name"] in table
@@ -48,7 +51,10 @@ def test_all_writes_every_name_with_times_and_ratios(tmp_path: Path, capsys: pyt
             assert r["peer"] and r["ratio"] == pytest.approx(r["peer_median_us"] / r["median_us"])
         else:
             assert (r["peer"], r["peer_median_us"], r["ratio"]) == (None, None, None)
-    assert all(r["p99_us"] >= r["median_us"] for r in rows if r["name"] in NAMES["latency"])
+    assert all(r["p99_us"] >= r["median_us"] for r in rows if r["name"] in (*NAMES["latency"], *NAMES["rate"]))
+    for r in rows:
+        if r["name"] in NAMES["rate"]:
+            assert 0.0 < r["mev_s"] <= r["offered_mev_s"] and 0.0 < r["batches_percent"] <= 100.0
     assert all(r["mev_s"] > 0.0 for r in rows if r["name"] in ("pipeline.one_process", "pipeline.sustained"))
 
 
@@ -69,6 +75,12 @@ def test_times_are_per_unit_and_the_ratio_is_the_peers_over_ours() -> None:
     result = measure(Case("x", lambda: 8_000, per=4, clocked=True, events=16), TINY)
     assert (result.median_us, result.mev_s) == (2.0, 2.0)
     assert Result("x", 2.0, 1, peer="y", peer_median_us=6.0).row()["ratio"] == 3.0
+
+
+def test_edges_are_as_fast_as_a_rate_wants_them() -> None:
+    camera = bench_input.RIG.left
+    made = bench_input.events(0.2, 0.0, seed=1, speed_px_s=bench_input.speed_for(6e6, camera))
+    assert len(made.t_ns) == pytest.approx(0.2 * 6e6, rel=0.05)
 
 
 def test_the_stream_is_the_seeds_and_both_cameras_see_the_same_edges() -> None:

@@ -179,7 +179,7 @@ def test_a_bad_event_is_counted_and_dropped_by_itself(name: str, bad: Events) ->
     both(ingest, mixed, T0_NS + 2 * MS)
     (batch,) = closed_by(ingest, T0_NS + 11 * MS)
     assert batch.n_events == 2
-    assert {k: v for k, v in ingest.counters.items() if v} == {name: 2, "batches": 1}
+    assert {k: v for k, v in ingest.counters.items() if v} == {name: 2, "events": 4, "batches": 1}
 
 
 def test_an_event_below_an_earlier_watermark_is_backwards() -> None:
@@ -258,7 +258,7 @@ def test_reordered_packets_are_put_right() -> None:
         ingest.handle(events([T0_NS + ms * MS]).packet(seq))
     (batch,) = event_batches(ingest.handle(watermark(4, T0_NS + 11 * MS, "left")))
     assert batch.n_events == 4
-    assert dict(ingest.counters) == {"batches": 1}
+    assert dict(ingest.counters) == {"events": 4, "batches": 1}
 
 
 def test_a_missing_packet_is_given_up_after_a_while_and_is_late_then() -> None:

@@ -3,34 +3,36 @@
 from __future__ import annotations
 
 import math
-import socket
 import sys
+from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import Any
 
 import cv2
 import numpy as np
 
+from velod.cli.bench_rate import rate
 from velod.cli.exit import RunFailed
 from velod.cli.files import write_json
+from velod.cli.through_processes import free_port, through_the_processes
 from velod.config import Settings, from_tree
 from velod.eval import bench_input
 from velod.eval.bench import Result, Size, measure
 from velod.eval.bench_cases import GROUPS, Packets, cases
-from velod.eval.bench_input import RIG, record
+from velod.eval.bench_input import RIG
 from velod.eval.latency import LEGS, Trace
 from velod.runtime.hop import measure as measure_hop
 from velod.runtime.offline import run_offline
-from velod.runtime.online import OnlineError, OnlineResult, run_online
-from velod.runtime.player import player_command
 from velod.runtime.warmup import fill_cache
 from velod.types import NS_PER_S, EventPacket, FlowBatch, Velocity
 from velod.wire import Envelope
 from velod.wire.topics import DEPTH, EVENTS, FLOW, IMU
 
-HOP, LATENCY = "hop", "latency"
+_MORE: dict[str, Callable[[Size], list[Result]]] = {
+    "hop": lambda size: hop(size),
+    "latency": lambda size: latency(3.0 * size.dataflow_seconds),
+    "rate": lambda size: rate(1.5 * size.dataflow_seconds),
+}
+"""Groups of cases that are measured together, by name."""
 
 
 def bench(group: str, json: str | None, size: Size | None = None) -> int:
@@ -42,9 +44,9 @@ def bench(group: str, json: str | None, size: Size | None = None) -> int:
     table = sys.stderr if json == "-" else sys.stdout
     print(_HEADER, file=table)
     results = []
-    for name in (*GROUPS, HOP, LATENCY) if group == "all" else (group,):
-        if name in (HOP, LATENCY):
-            results += (several := hop(size) if name == HOP else latency(3.0 * size.dataflow_seconds))
+    for name in (*GROUPS, *_MORE) if group == "all" else (group,):
+        if name in _MORE:
+            results += (several := _MORE[name](size))
             for result in several:
                 print(_line(result), file=table, flush=True)
             continue
@@ -72,7 +74,7 @@ def hop(size: Size) -> list[Result]:
         0, int(e.t_ns[first][-1]), "left", e.x[first], e.y[first], e.t_ns[first].astype(np.int64), e.p[first]
     )
     try:
-        us = measure_hop(packet, n, _free_port())
+        us = measure_hop(packet, n, free_port())
     except TimeoutError as error:
         raise RunFailed(str(error)) from None
     return [
@@ -98,7 +100,7 @@ def dataflow(seconds: float) -> Result:
         optimizer=replace(settings.optimizer, max_wait_ms=math.inf),
         zenoh=replace(settings.zenoh, lossless=True),
     )
-    result, events = _through_the_processes(settings, seconds, speed=None)
+    result, events = through_the_processes(settings, seconds, speed=None)
     out = result.velocities
     host_us = (out[-1].t_pub_ns - out[0].t_pub_ns) / 1e3
     sensor_s = (out[-1].velocity.t_ns - out[0].velocity.t_ns) / NS_PER_S
@@ -123,7 +125,7 @@ def event_latency(seconds: float) -> Result:
         elif isinstance(message, FlowBatch):
             flows[message.t_ns] = envelope.t_pub_ns
 
-    _through_the_processes(settings, seconds, speed=1.0, packets="1000hz", on_envelope=note, topics=(EVENTS, FLOW))
+    through_the_processes(settings, seconds, speed=1.0, packets="1000hz", on_envelope=note, topics=(EVENTS, FLOW))
     ends = np.array(sorted(packets))
     waited_ns = [
         published_ns - packets[int(ends[k])]
@@ -143,7 +145,7 @@ def latency(seconds: float) -> list[Result]:
     SessionError.
     """
     trace = Trace()
-    _through_the_processes(
+    through_the_processes(
         Settings(), seconds, 1.0, speed_px_s=bench_input.CORRIDOR_2_PX_S,
         on_envelope=trace.note, on_velocity=lambda p: trace.note(Envelope(p.velocity, p.t_pub_ns, p.t_origin_ns)),
         topics=(FLOW, DEPTH, IMU),
@@ -157,43 +159,6 @@ def latency(seconds: float) -> list[Result]:
     ]
 
 
-def _through_the_processes(
-    settings: Settings,
-    seconds: float,
-    speed: float | None,
-    packets: str = "200hz",
-    speed_px_s: float = bench_input.SPEED_PX_S,
-    **listening: Any,
-) -> tuple[OnlineResult, int]:
-    """Play the benchmark's stream through all processes; what came out, and how many events went in.
-
-    Raises RunFailed, SessionError.
-    """
-    zenoh, rig = replace(settings.zenoh, port=_free_port()), replace(settings.rig, name="bench")
-    trouble: list[str] = []
-    with TemporaryDirectory() as directory:
-        path = Path(directory) / "stream.h5"
-        events = record(path, seconds, seed=1, speed_px_s=speed_px_s)
-        driver = player_command(str(path), zenoh, rig.name, speed, packets)
-        try:
-            result = run_online(
-                replace(settings, zenoh=zenoh, rig=rig), RIG, driver, on_line=trouble.append, **listening
-            )
-        except OnlineError as e:
-            raise RunFailed(str(e)) from None
-    out = result.velocities
-    if len(out) < 2 or out[-1].t_pub_ns == out[0].t_pub_ns:
-        raise RunFailed("the processes put out nothing: " + "; ".join(trouble[-3:]))
-    return result, events
-
-
-def _free_port() -> int:
-    with socket.socket() as s:
-        s.bind(("127.0.0.1", 0))
-        port: int = s.getsockname()[1]
-        return port
-
-
 _HEADER = f"{'':20s} {'median':>12s} {'peer':>12s} {'ratio':>8s}  {'n':>4s}"
 
 
@@ -201,9 +166,13 @@ def _line(r: Result) -> str:
     peer = ratio = ""
     if r.peer_median_us is not None:
         peer, ratio = _time(r.peer_median_us), f"{r.peer_median_us / r.median_us:.1f}"
-    note = r.peer or ("" if r.mev_s is None else f"{r.mev_s:.1f} M events/s, both cameras")
-    if r.p99_us is not None:
-        note = f"p99 {_time(r.p99_us)}"
+    notes = [
+        r.peer or "",
+        "" if r.p99_us is None else f"p99 {_time(r.p99_us)}",
+        "" if r.mev_s is None else f"{r.mev_s:.1f} M events/s, both cameras",
+        *(f"{name} {value:.3g}" for name, value in r.more.items()),
+    ]
+    note = ", ".join(filter(None, notes))
     return f"{r.name:20s} {_time(r.median_us):>12s} {peer:>12s} {ratio:>8s}  {r.n:4d}  {note}".rstrip()
 
 

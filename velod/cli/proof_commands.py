@@ -8,7 +8,7 @@ import os
 from velod.cli import prove
 from velod.cli.options import Commands, command, plain
 
-_BENCHES = ("all", "flow", "depth", "solve", "codec", "pipeline", "hop", "latency")
+_BENCHES = ("all", "flow", "depth", "solve", "codec", "pipeline", "hop", "latency", "rate")
 
 
 def add_commands(commands: Commands) -> None:
@@ -27,7 +27,8 @@ def _add_bench(commands: Commands) -> None:
         "what else computes first.",
         "  velod bench                           everything, in about a minute\n"
         "  velod bench solve --json out.json     the optimizer alone; the numbers into a file\n"
-        "  velod bench latency                   through all processes: where a batch's time goes, p50 and p99",
+        "  velod bench latency                   through all processes: where a batch's time goes, p50 and p99\n"
+        "  velod bench rate                      real time, at 16 and 20 M events/s, on three sizes of sensor",
     )
     parser.add_argument(
         "group", nargs="?", default="all", choices=_BENCHES, metavar="GROUP", help=", ".join(_BENCHES)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import KW_ONLY, dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import KW_ONLY, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -53,6 +53,7 @@ class Result:
     peer_median_us: float | None = None
     mev_s: float | None = None  # million events a second, where a unit takes many in
     p99_us: float | None = None
+    more: Mapping[str, float] = field(default_factory=dict)  # further fields, by name and unit
 
     def row(self) -> dict[str, Any]:
         """The fields of ``velod bench --json``; ratio = peer / ours."""
@@ -66,7 +67,7 @@ class Result:
             "n": self.n,
         }
         more = {"mev_s": self.mev_s, "p99_us": self.p99_us}
-        return row | {name: value for name, value in more.items() if value is not None}
+        return row | {name: value for name, value in more.items() if value is not None} | dict(self.more)
 
 
 def measure(case: Case, size: Size) -> Result:

@@ -18,6 +18,8 @@ from velod.types import F64, NS_PER_S, DepthBatch, EventPacket, FlowBatch, ImuPa
 CAMERA = Camera(width=346, height=260, fx=231.5, fy=231.5, cx=172.5, cy=129.5)
 RIG = Calibration(left=CAMERA, right=CAMERA, R_RL=np.eye(3), t_RL=np.array([-0.12, 0.0, 0.0]))
 
+VGA_CAMERA = Camera(width=640, height=480, fx=428.2, fy=428.2, cx=319.5, cy=239.5)
+VGA_RIG = Calibration(left=VGA_CAMERA, right=VGA_CAMERA, R_RL=np.eye(3), t_RL=np.array([-0.12, 0.0, 0.0]))
 LARGE_CAMERA = Camera(width=1280, height=720, fx=856.4, fy=856.4, cx=639.5, cy=359.5)
 LARGE_RIG = Calibration(left=LARGE_CAMERA, right=LARGE_CAMERA, R_RL=np.eye(3), t_RL=np.array([-0.12, 0.0, 0.0]))
 LARGE_SPEED_PX_S = 125.0
@@ -105,12 +107,28 @@ def _packet(seq: int, camera: str, e: Columns, start_ns: int, end_ns: int) -> Ev
     return EventPacket(seq, end_ns, camera, e.x[part], e.y[part], e.t_ns[part], e.p[part])
 
 
-def record(path: Path, seconds: float, seed: int, speed_px_s: float = SPEED_PX_S) -> int:
-    """Write the stream of ``packets`` as a recording; returns the number of events of both cameras."""
+def speed_for(rate_hz: float, camera: Camera) -> float:
+    """Speed of the edges, px/s, at which ``camera`` has so many events a second."""
+    return rate_hz * sum(SPACING_PX) / 2 / (BURST * camera.width * camera.height)
+
+
+def true_velocity(speed_px_s: float, rig: Calibration) -> F64:
+    """v_B (3,), m/s, of a rig that sees the stream slide to the right, all of it at the same disparity d.
+
+    v_x = -speed Z / f, and Z = f b / d.
+    """
+    baseline_m = -float(rig.t_RL[0])
+    return np.array([-speed_px_s * baseline_m / DISPARITY_PX, 0.0, 0.0])
+
+
+def record(path: Path, seconds: float, seed: int, speed_px_s: float = SPEED_PX_S, rig: Calibration = RIG) -> int:
+    """Write the stream of ``packets``, as ``rig`` sees it, as a recording; returns the number of events of both
+    cameras.
+    """
     written = 0
-    with RecordingWriter(path, RIG) as writer:
+    with RecordingWriter(path, rig, packed=False) as writer:
         for side, shift_px in (("left", 0.0), ("right", DISPARITY_PX)):
-            e = events(seconds, shift_px, seed, speed_px_s=speed_px_s)
+            e = events(seconds, shift_px, seed, rig.left, speed_px_s)
             writer.append(side, EventColumns(t_ns=e.t_ns, x=e.x, y=e.y, p=e.p))
             written += len(e.t_ns)
         t_ns = np.arange(0, int(seconds * NS_PER_S), IMU_NS, dtype=np.int64)

@@ -46,9 +46,10 @@ Output = EventBatch | StereoBatch | ImuSamples
 class IngestStage:
     """Owns the surfaces of both cameras.
 
-    ``counters``: "batches", "batches.without_right", "clock.restart", drops by cause ("packets.*", "events.*",
-    "imu.*") and by the budget ("shed.events", "shed.batches"). ``alarms``: what is wrong at the moment
-    ("camera.left", "camera.right", "imu.frozen"). ``budget``: what may be taken on, from the next message on.
+    ``counters``: "events" taken in, "batches", "batches.without_right", "clock.restart", drops by cause
+    ("packets.*", "events.*", "imu.*") and by the budget ("shed.events", "shed.batches"). ``alarms``: what is wrong
+    at the moment ("camera.left", "camera.right", "imu.frozen"). ``budget``: what may be taken on, from the next
+    message on.
     """
 
     def __init__(self, settings: Settings, calibration: Calibration) -> None:

@@ -109,6 +109,8 @@ class CameraStream:
                 self._seen_ns, self._second, self._fired, dropped,
             )  # fmt: skip
         self.queue.commit(kept)
+        if kept:
+            self._counters["events"] += kept
         self._bound_queue()
         self.watermark_ns = max(self.watermark_ns, packet.t_ns)
         count_drops(self._counters, DROPS, dropped)
