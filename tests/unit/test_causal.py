@@ -14,10 +14,12 @@ from hypothesis import strategies as st
 from tests.moving_edges import HEIGHT, T0_NS, WIDTH, Events, edges
 from velod.events.causal import all_open, enter_and_select, split_ages
 from velod.events.plane_fit import NOISE_RMS2, fit_plane
-from velod.events.sae import NEVER, new_surface, update_sae
+from velod.events.sae import NEVER, update_sae
 from velod.events.selection import GOOD, MAX_ASYMMETRY, SYMMETRY_NOISE
+from velod.events.surface_clock import new_surface
 
 MS = 1_000_000
+EPOCH_NS = T0_NS - 7
 MEMORY, REFRACTORY, CELL_PX, BORDER = 100 * MS, 10 * MS, 7, 5
 RING = [(dy, dx) for dy in (-3, 0, 3) for dx in (-3, 0, 3) if (dy, dx) != (0, 0)]
 
@@ -39,12 +41,12 @@ def selected(events: Events, rest_ns: int = 0, capacity: int = 20_000, time_nois
     rows, columns = np.arange(HEIGHT) // CELL_PX, np.arange(WIDTH) // CELL_PX
     at, stamps = np.empty((capacity, 3), np.int32), np.empty((capacity, 49), np.int64)
     n = enter_and_select(
-        events.x, events.y, events.t_ns, events.p, first, last, REFRACTORY,
+        events.x, events.y, events.t_ns, events.p, first, last, REFRACTORY, EPOCH_NS,
         taken, all_open(rows[-1] + 1, columns[-1] + 1), rows, columns, rest_ns, BORDER,
         MEMORY, 1.0, 2, 20, 0.35, time_noise_s, at, stamps, 0,
     )  # fmt: skip
     same_first, same_last = new_surface(HEIGHT, WIDTH), new_surface(HEIGHT, WIDTH)
-    update_sae(events.x, events.y, events.t_ns, events.p, same_first, same_last, REFRACTORY)
+    update_sae(events.x, events.y, events.t_ns, events.p, same_first, same_last, REFRACTORY, EPOCH_NS)
     assert np.array_equal(first, same_first) and np.array_equal(last, same_last)
     return Selected(at[:n], stamps[:n])
 

@@ -9,8 +9,9 @@ import pytest
 
 from tests.moving_edges import HEIGHT, T0_NS, WIDTH, Events, edges
 from velod.events.plane_fit import NOISE_RMS2, fit_plane
-from velod.events.sae import NEVER, encode_ages, new_surface, update_sae
+from velod.events.sae import encode_ages, update_sae
 from velod.events.selection import MAX_ASYMMETRY, SYMMETRY_NOISE, select_burst, select_paper
+from velod.events.surface_clock import EMPTY, new_surface
 
 MS = 1_000_000
 MEMORY = 100 * MS
@@ -67,7 +68,7 @@ def test_neighbourhoods_completed_in_an_earlier_batch_are_left_alone() -> None:
 
 def test_what_the_quota_leaves_room_for_are_events_with_a_narrow_neighbourhood_passed_before() -> None:
     first, t_end = one_edge(60.1)
-    first[:, 17:] = first[:, :10] = NEVER  # a strip of the edge, too short for a 7x7 about most of its rows
+    first[:, 17:] = first[:, :10] = EMPTY  # a strip of the edge, too short for a 7x7 about most of its rows
     _, y, _ = burst(first, t_end - 4 * MS, t_end, quota=500)
     assert set(y) == {12, 13, 14}  # the columns passed in these 4 ms: rows 13 = middle of 7
 
@@ -160,7 +161,7 @@ def test_with_room_for_all_selection_is_what_its_plain_twin_says(seed: int, time
     first, _ = surfaces(kept)
     first += rng.integers(-MS, MS, first.shape)
     t_start, t_end = T0_NS + 70 * MS, T0_NS + 95 * MS
-    first[first >= t_end] = NEVER
+    first[first >= t_end] = EMPTY
     x, y, p = burst(first, t_start, t_end, quota=5000, time_noise_s=time_noise_s)
     got = set(zip(x.tolist(), y.tolist(), p.tolist(), strict=True))
     wide = burst_twin(first, t_end, t_start, t_end, 3, time_noise_s)

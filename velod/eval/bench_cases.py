@@ -21,8 +21,9 @@ from velod.eval import bench_input
 from velod.eval.bench import Case, Size
 from velod.eval.bench_input import RIG
 from velod.events.plane_fit import SIZE
-from velod.events.sae import new_surface, update_sae
+from velod.events.sae import update_sae
 from velod.events.sensor_size import for_sensor
+from velod.events.surface_clock import SurfaceClock
 from velod.flow.stage import FlowStage
 from velod.ingest.stage import IngestStage
 from velod.optimizer.estimator import Estimator
@@ -97,14 +98,16 @@ def sae(size: Size) -> Case:
     e = bench_input.events(size.seconds, 0.0, seed=2)
     n = min(size.events, len(e.t_ns))
     h, w = RIG.left.height, RIG.left.width
-    first, last = new_surface(h, w), new_surface(h, w)
+    clock = SurfaceClock(h, w)
+    first, last = clock.new_surface(), clock.new_surface()
     x, y, t_ns, p = e.x[:n], e.y[:n], e.t_ns[:n].copy(), e.p[:n]
     lap_ns = int(t_ns[-1] - t_ns[0]) + 1
 
     def run() -> None:
         # The same events over and over, each time later.
         np.add(t_ns, lap_ns, out=t_ns)
-        update_sae(x, y, t_ns, p, first, last, 10_000_000)
+        for part in clock.spans(t_ns):
+            update_sae(x[part], y[part], t_ns[part], p[part], first, last, 10_000_000, clock.epoch_ns)
 
     return Case("events.sae", run, per=n)
 

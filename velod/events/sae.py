@@ -2,7 +2,8 @@
 
 Two surfaces are kept of each camera. An edge fires several events per pixel, so ``first`` holds the first event
 of the newest burst (what the plane fit needs), and ``last`` the last event of any kind (what the time surfaces of
-block matching need). Stamps are int64 ns of sensor time, ``NEVER`` where nothing has happened.
+block matching need). Stamps are those of a ``SurfaceClock``: int32 ns since its epoch, ``EMPTY`` where nothing has
+happened; a time that they are compared with is taken there by ``SurfaceClock.stamp``.
 """
 
 from __future__ import annotations
@@ -11,72 +12,69 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from velod.events.plane_fit import HALF, REACH, RING_COLUMN, RING_ROW, SIZE
-from velod.types import I64, PATCH, U8, U16, U32
+from velod.types import I32, I64, PATCH, U8, U16, U32
 
 NEVER = -(2**62)
-"""Stamp of a pixel without events: older than any memory, and far from int64 overflow in differences."""
+"""A time before all others, and far from int64 overflow in differences."""
 
 MAX_U16 = 65_535
 
-CACHED = 1 << 18
-"""Stamps of a surface that the second-level cache holds. Of larger ones both are fetched at once."""
-BLOCK = 4096
+BLOCK = 1024
 """Events that are entered into one surface before the other one's turn comes."""
-
-I32 = NDArray[np.int32]
-
-
-def new_surface(height: int, width: int) -> I64:
-    """An empty surface (2, height, width): index 0 = OFF, 1 = ON."""
-    return np.full((2, height, width), NEVER, np.int64)
 
 
 @njit(cache=True, nogil=True)
-def update_sae(x: U16, y: U16, t_ns: I64, p: U8, first: I64, last: I64, refractory_ns: int) -> None:
+def update_sae(
+    x: U16, y: U16, t_ns: I64, p: U8, first: I32, last: I32, refractory_ns: int, epoch_ns: int = 0
+) -> None:
     """Enter events, in time order, into ``first`` and ``last`` (2, h, w), in place.
 
     An event sooner than ``refractory_ns`` after the last one of its pixel and polarity belongs to that one's burst
-    and updates only ``last``. Coordinates and polarities must have been checked.
+    and updates only ``last``. Coordinates and polarities must have been checked, and times fit ``epoch_ns``.
     """
-    if last.size > CACHED:
-        for i in range(t_ns.size):
-            k, r, c, t = p[i], y[i], x[i], t_ns[i]
-            if t - last[k, r, c] >= refractory_ns:
-                first[k, r, c] = t
-            last[k, r, c] = t
-        return
     # One surface at a time: stores into two by turns take twice as long.
     n = min(t_ns.size, BLOCK)
-    at, begins = np.empty(n, np.int32), np.empty(n, np.int32)
+    at, stamp, begins = np.empty(n, np.int32), np.empty(n, np.int32), np.empty(n, np.int32)
     flat = first.reshape(-1)
     for start in range(0, t_ns.size, BLOCK):
-        block = slice(start, start + BLOCK)
-        ts = t_ns[block]
-        for i in begins[: enter_last(x[block], y[block], ts, p[block], last, refractory_ns, at, begins)]:
-            flat[np.uint32(at[i])] = ts[i]
+        b = slice(start, start + BLOCK)
+        m = enter_last(x[b], y[b], t_ns[b], p[b], last, refractory_ns, epoch_ns, at, stamp, begins)
+        for i in begins[:m]:
+            flat[np.uint32(at[i])] = stamp[i]
 
 
 @njit(cache=True, nogil=True)
-def enter_last(x: U16, y: U16, t_ns: I64, p: U8, last: I64, refractory_ns: int, at: I32, begins: I32) -> int:
+def enter_last(
+    x: U16,
+    y: U16,
+    t_ns: I64,
+    p: U8,
+    last: I32,
+    refractory_ns: int,
+    epoch_ns: int,
+    at: I32,
+    stamp: I32,
+    begins: I32,
+) -> int:
     """Enter events, in time order, into ``last`` (2, h, w); writes which of them begin a burst to ``begins`` (n,).
 
-    Their flat places in ``last`` are written to ``at`` (n,), in a loop of its own, which vectorises. Returns how many
-    begin one.
+    Their flat places in ``last`` are written to ``at`` (n,) and their stamps to ``stamp`` (n,), in a loop of its own,
+    which vectorises. Returns how many begin one.
     """
     _, h, w = last.shape
     for i in range(t_ns.size):
         at[i] = (np.int32(p[i]) * np.int32(h) + np.int32(y[i])) * np.int32(w) + np.int32(x[i])
+        stamp[i] = np.int32(t_ns[i] - epoch_ns)
     flat = last.reshape(-1)
     n = 0
     for i in range(t_ns.size):
         # Unsigned, so that nobody looks whether it counts from the end.
-        place, t = np.uint32(at[i]), t_ns[i]
+        place = np.uint32(at[i])
         begins[n] = i
-        n += t - flat[place] >= refractory_ns
-        flat[place] = t
+        n += stamp[i] - flat[place] >= refractory_ns
+        flat[place] = stamp[i]
     return n
 
 
@@ -103,31 +101,31 @@ def _per_unit(unit_ns: int) -> np.uint64:
 
 
 @njit(cache=True, nogil=True)
-def _encode_ages(stamp: I64, t_end_ns: int, memory_ns: int, unit_ns: int, out: U16) -> None:
+def _encode_ages(stamp: I32, t_end_ns: int, memory_ns: int, unit_ns: int, out: U16) -> None:
     per_unit = _per_unit(unit_ns)
     for i in range(stamp.size):
         out[i] = _steps(stamp[i], t_end_ns, memory_ns, unit_ns, per_unit)
 
 
 @njit(cache=True, nogil=True)
-def _encode_newest(a: I64, b: I64, t_end_ns: int, memory_ns: int, unit_ns: int, out: U16) -> None:
+def _encode_newest(a: I32, b: I32, t_end_ns: int, memory_ns: int, unit_ns: int, out: U16) -> None:
     per_unit = _per_unit(unit_ns)
     for i in range(a.size):
         out[i] = _steps(max(a[i], b[i]), t_end_ns, memory_ns, unit_ns, per_unit)
 
 
-def encode_ages(stamp: I64, t_end_ns: int, memory_ns: int) -> U16:
+def encode_ages(stamp: I32, t_end_ns: int, memory_ns: int) -> U16:
     """Ages before ``t_end_ns`` in steps of ``age_unit_ns(memory_ns)``, rounded up; 0 beyond the memory.
 
-    ``stamp``: C-contiguous int64 of any shape, ns; the result has the same shape. Stamps at or after ``t_end_ns``
-    give 0.
+    ``stamp``: C-contiguous int32 of any shape, ns of the clock that ``t_end_ns`` is of; the result has the same
+    shape. Stamps at or after ``t_end_ns`` give 0.
     """
     out = np.empty(stamp.shape, np.uint16)
     _encode_ages(stamp.reshape(-1), t_end_ns, memory_ns, age_unit_ns(memory_ns), out.reshape(-1))
     return out
 
 
-def encode_newest(stamp: I64, t_end_ns: int, memory_ns: int) -> U16:
+def encode_newest(stamp: I32, t_end_ns: int, memory_ns: int) -> U16:
     """``encode_ages`` of the newest stamp of either polarity, (h, w), for a surface (2, h, w)."""
     out = np.empty(stamp.shape[1:], np.uint16)
     off, on = stamp.reshape(2, -1)
@@ -137,7 +135,7 @@ def encode_newest(stamp: I64, t_end_ns: int, memory_ns: int) -> U16:
 
 @njit(cache=True, nogil=True)
 def gather_patches(
-    surface: I64, x: U16, y: U16, p: U8, t_end_ns: int, memory_ns: int, age: U32, patch: U32, ring: U32
+    surface: I32, x: U16, y: U16, p: U8, t_end_ns: int, memory_ns: int, age: U32, patch: U32, ring: U32
 ) -> None:
     """Ages (ns before ``t_end_ns``) of the events and of their same-polarity neighbours on ``surface``.
 

@@ -14,8 +14,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from velod.events.plane_fit import HALF, REACH, SIZE, fit_plane, rms_px
-from velod.events.sae import NEVER, age_unit_ns
-from velod.types import F64, I64, PATCH, U8, U16
+from velod.events.sae import age_unit_ns
+from velod.events.surface_clock import new_surface
+from velod.types import F64, I32, I64, PATCH, U8, U16
 
 DRAWS = 8
 """Candidates tried in a cell before it is the next one's turn."""
@@ -29,7 +30,6 @@ MAX_ASYMMETRY = 0.5
 SYMMETRY_NOISE = 8.0
 """... but for what the time stamps' noise adds to the four sums of it, in its standard deviations."""
 
-I32 = NDArray[np.int32]
 U64 = NDArray[np.uint64]
 
 PAPER_MIN_NEIGHBOURS = 16
@@ -37,8 +37,8 @@ PAPER_MIN_NEIGHBOURS = 16
 
 
 def select_burst(
-    first: I64,
-    taken: I64,
+    first: I32,
+    taken: I32,
     encoded: U16,
     t_start_ns: int,
     t_end_ns: int,
@@ -57,7 +57,7 @@ def select_burst(
 
     An event itself comes when its edge has crossed half of the neighbourhood; the plane can be fitted without bias
     only once the other half has fired too. So an event is selected in the batch that completes its 7x7: the newest of
-    its outer same-polarity neighbours on ``first`` (2, h, w), int64 ns, lies in [t_start_ns, t_end_ns), and a plane
+    its outer same-polarity neighbours on ``first`` (2, h, w), lies in [t_start_ns, t_end_ns), and a plane
     leaves ``min_neighbours`` of the inner 25 after rejection (see ``fit_plane``) and ``rms_px`` below ``max_rms_px``.
     It is at most half the memory old, so it may be older than the batch. Time stamps have an error of
     ``time_noise_s``.
@@ -92,7 +92,7 @@ def select_burst(
 
 
 def select_paper(
-    last: I64,
+    last: I32,
     t_start_ns: int,
     t_end_ns: int,
     *,
@@ -102,7 +102,7 @@ def select_paper(
     quota: int,
     seq: int,
 ) -> tuple[U16, U16, U8]:
-    """The culling rules of Sec. V-A on the unfiltered surface ``last`` (2, h, w), int64 ns.
+    """The culling rules of Sec. V-A on the unfiltered surface ``last`` (2, h, w).
 
     Kept are events in [t_start_ns, t_end_ns) that are (1) ``border_px`` inside, (2) have more than 15 neighbours
     and (3) differ from the neighbours' mean time by at most ``time_share`` of the batch's duration.
@@ -111,7 +111,7 @@ def select_paper(
     border_px = max(border_px, REACH)
     inside = np.s_[:, border_px:-border_px, border_px:-border_px]
     mask[inside] = (last[inside] >= t_start_ns) & (last[inside] < t_end_ns)
-    none_taken = np.full(last.shape, NEVER, np.int64)
+    none_taken = new_surface(*last.shape[1:])
     chosen = _choose(
         last, marks, t_end_ns, memory_ns, quota, seq,
         False, time_share * (t_end_ns - t_start_ns) * 1e-9, 0, PAPER_MIN_NEIGHBOURS, math.inf, 0.0, none_taken,
@@ -124,13 +124,13 @@ def cell_side_px(height: int, width: int, quota: int) -> int:
     return max(1, round(math.sqrt(height * width / quota)))
 
 
-def _new_mask(surface: I64) -> tuple[U8, U64]:
+def _new_mask(surface: I32) -> tuple[U8, U64]:
     """Zeros of the shape of ``surface``, a byte each, and the same memory eight at a time, with as many more."""
     marks = np.zeros(-(-surface.size // 8), np.uint64)
     return marks.view(np.uint8)[: surface.size].reshape(surface.shape), marks
 
 
-def _columns(chosen: I32, surface: I64) -> tuple[U16, U16, U8]:
+def _columns(chosen: I32, surface: I32) -> tuple[U16, U16, U8]:
     _, h, w = surface.shape
     p, rest = np.divmod(np.sort(chosen), h * w)
     y, x = np.divmod(rest, w)
@@ -138,7 +138,7 @@ def _columns(chosen: I32, surface: I64) -> tuple[U16, U16, U8]:
 
 
 def _choose(
-    surface: I64,
+    surface: I32,
     marks: U64,
     t_end_ns: int,
     memory_ns: int,
@@ -150,7 +150,7 @@ def _choose(
     min_neighbours: int,
     max_rms_px: float,
     time_noise_s: float,
-    taken: I64,
+    taken: I32,
 ) -> I32:
     """Flat indices into ``surface`` of at most ``quota`` events out of those marked (see ``_new_mask``).
 
@@ -223,7 +223,7 @@ def _oldest_if_none(age: np.uint16) -> np.float32:
 
 
 @njit(cache=True, nogil=True)
-def _candidates(surface: I64, taken: I64, marks: U64, cell_px: int, columns: int, index: I32, cell_end: I32) -> None:
+def _candidates(surface: I32, taken: I32, marks: U64, cell_px: int, columns: int, index: I32, cell_end: I32) -> None:
     """Flat indices of marked and untaken stamps, sorted by cell: cell c is index[cell_end[c] : cell_end[c + 1]].
 
     ``marks`` as of ``_new_mask``. What is found is written whether it counts or not, and overwritten if not: a branch
@@ -262,7 +262,7 @@ def _candidates(surface: I64, taken: I64, marks: U64, cell_px: int, columns: int
 
 @njit(cache=True, nogil=True)
 def _take_in_turn(
-    surface: I64,
+    surface: I32,
     t_end_ns: int,
     memory_ns: int,
     burst: bool,
@@ -356,7 +356,7 @@ def _below(state: np.uint64, n: int) -> int:
 
 
 @njit(cache=True, nogil=True)
-def _ages(surface: I64, r: int, c: int, t_end_ns: int, memory_ns: int, age: F64) -> None:
+def _ages(surface: I32, r: int, c: int, t_end_ns: int, memory_ns: int, age: F64) -> None:
     """Ages in s of the 5x5 neighbourhood, 0 where older than the memory."""
     for j in range(SIZE):
         a = t_end_ns - surface[r - HALF + j // PATCH, c - HALF + j % PATCH]

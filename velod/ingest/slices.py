@@ -11,7 +11,7 @@ import numpy as np
 from velod.config import Settings
 from velod.events.causal import all_open, enter_and_select, split_ages
 from velod.events.plane_fit import SIZE, WIDE_SIZE
-from velod.events.sae import NEVER, new_surface
+from velod.events.sae import NEVER
 from velod.events.selection import cell_side_px
 from velod.ingest.batch import OpenBatch
 from velod.ingest.budget import Budget
@@ -37,15 +37,15 @@ class Slices:
         self._row_cell, self._column_cell = np.arange(height) // cell_px, np.arange(width) // cell_px
         # Pages that are never written to cost nothing.
         self._at = np.empty((MAX_SELECTED, 3), np.int32)
-        self._stamps = np.empty((MAX_SELECTED, WIDE_SIZE), np.int64)
-        self._shape = (height, width)
+        self._times_ns = np.empty((MAX_SELECTED, WIDE_SIZE), np.int64)
         self._seq = -1
         self._time_noise_ns = 0
-        self.forget()
+        self._sent = 0
 
-    def forget(self) -> None:
-        """The sensor's clock has been set anew: nothing is selected, every cell is open."""
-        self._taken = new_surface(*self._shape)
+    def begin_epoch(self, left: CameraStream) -> None:
+        """The sensor's clock has been set anew, or for the first time: nothing is selected, every cell is open."""
+        self._left = left
+        self._taken = left.clock.new_surface()
         self._open_ns = all_open(int(self._row_cell[-1]) + 1, int(self._column_cell[-1]) + 1)
         self._end_ns: int | None = None  # of the slice that has begun
         self._n_events = 0  # that went in since the last slice came out
@@ -65,7 +65,6 @@ class Slices:
 
     def advance(
         self,
-        left: CameraStream,
         batch: OpenBatch,
         batch_seq: int,
         horizon_ns: int,
@@ -82,11 +81,11 @@ class Slices:
         rest_ns = round(self._settings.ingest.rest_ms * 1e6 / budget.selection)
         while True:
             if self._end_ns is None:
-                queued_t_ns = left.queue.peek()[2]
+                queued_t_ns = self._left.queue.peek()[2]
                 if not len(queued_t_ns) or queued_t_ns[0] >= horizon_ns:
                     break
                 self._end_ns = (int(queued_t_ns[0]) // self._slice_ns + 1) * self._slice_ns
-            self._enter(left, batch, min(self._end_ns, horizon_ns), rest_ns)
+            self._enter(batch, min(self._end_ns, horizon_ns), rest_ns)
             if horizon_ns < self._end_ns:
                 break
             if budget.slices:
@@ -104,23 +103,24 @@ class Slices:
     def selected(self, t_end_ns: int) -> tuple[U16, U16, U32, U8]:
         """x, y, age (ns before ``t_end_ns``) and p of all events that were selected since ``begin_batch``."""
         p, y, x = self._at[: self._n].T
-        age = np.minimum(t_end_ns - self._stamps[: self._n, MIDDLE], MAX_AGE_NS)
+        age = np.minimum(t_end_ns - self._times_ns[: self._n, MIDDLE], MAX_AGE_NS)
         return x.astype(np.uint16), y.astype(np.uint16), age.astype(np.uint32), p.astype(np.uint8)
 
     def patches(self, t_end_ns: int) -> U32:
         """(n, 25) ages in ns of the 5x5 neighbours of all events that were selected since ``begin_batch``."""
         return self._ages(slice(self._n), t_end_ns)[1]
 
-    def _enter(self, left: CameraStream, batch: OpenBatch, t_ns: int, rest_ns: int) -> None:
-        s, fit = self._settings.ingest, self._settings.flow
+    def _enter(self, batch: OpenBatch, t_ns: int, rest_ns: int) -> None:
+        s, fit, left = self._settings.ingest, self._settings.flow, self._left
         x, y, t, p = left.take_before(t_ns)
-        self._n = enter_and_select(
-            x, y, t, p, left.first, left.last, left.refractory_ns,
-            self._taken, self._open_ns, self._row_cell, self._column_cell, rest_ns, s.border_px,
-            self._memory_ns, fit.reject_px, fit.rejections, s.min_neighbours, fit.max_rms_px,
-            1e-9 * self._time_noise_ns,
-            self._at, self._stamps, self._n,
-        )  # fmt: skip
+        for part in left.clock.spans(t):
+            self._n = enter_and_select(
+                x[part], y[part], t[part], p[part], left.first, left.last, left.refractory_ns, left.clock.epoch_ns,
+                self._taken, self._open_ns, self._row_cell, self._column_cell, rest_ns, s.border_px,
+                self._memory_ns, fit.reject_px, fit.rejections, s.min_neighbours, fit.max_rms_px,
+                1e-9 * self._time_noise_ns,
+                self._at, self._times_ns, self._n,
+            )  # fmt: skip
         self._n_events += len(t)
         batch.fill(t)
 
@@ -146,8 +146,8 @@ class Slices:
 
     def _ages(self, which: slice, t_end_ns: int) -> tuple[U32, U32, U32]:
         """age (n,), patch (n, 25) and ring (n, 24) of these of the selected, ns before ``t_end_ns``."""
-        stamps = self._stamps[which]
-        n = len(stamps)
+        times_ns = self._times_ns[which]
+        n = len(times_ns)
         age, patch, ring = np.empty(n, np.uint32), np.empty((n, SIZE), np.uint32), np.empty((n, RING), np.uint32)
-        split_ages(stamps, t_end_ns, self._memory_ns, age, patch, ring)
+        split_ages(times_ns, t_end_ns, self._memory_ns, age, patch, ring)
         return age, patch, ring

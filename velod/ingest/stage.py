@@ -14,7 +14,7 @@ import numpy as np
 from velod.alarms import Alarms
 from velod.config import Settings
 from velod.events.plane_fit import SIZE
-from velod.events.sae import NEVER, age_unit_ns, encode_ages, encode_newest, gather_patches, new_surface
+from velod.events.sae import NEVER, age_unit_ns, encode_ages, encode_newest, gather_patches
 from velod.events.selection import select_burst, select_paper
 from velod.events.sensor_size import for_sensor
 from velod.events.time_noise import TimeNoise
@@ -76,7 +76,7 @@ class IngestStage:
         self._left = CameraStream(s, cal.left.width, cal.left.height, self.counters)
         self._right = CameraStream(s, cal.right.width, cal.right.height, self.counters)
         self._imu = ImuStream(s, cal.time_offset_s, self.counters, self.alarms)
-        self._taken = new_surface(cal.left.height, cal.left.width)
+        self._taken = self._left.clock.new_surface()
         self._open = OpenBatch(s)
         # The paper's rules know nothing of it.
         self._time_noise = TimeNoise(self._settings.flow) if s.selection == "burst" else None
@@ -85,7 +85,7 @@ class IngestStage:
         if self._slices is not None:
             # Parts of a batch that will never be whole must not join another one.
             self._batch_seq += self._slices.has_sent
-            self._slices.forget()
+            self._slices.begin_epoch(self._left)
         self.alarms.clear()
 
     def handle(self, message: EventPacket | ImuPacket) -> list[Output]:
@@ -171,11 +171,7 @@ class IngestStage:
         if self._slices is None:
             self._open.fill(self._left.enter_before(horizon_ns))
             return []
-        return [
-            *self._slices.advance(
-                self._left, self._open, self._batch_seq + 1, horizon_ns, self.budget, self._noise_ns
-            )
-        ]
+        return [*self._slices.advance(self._open, self._batch_seq + 1, horizon_ns, self.budget, self._noise_ns)]
 
     def _is_complete(self, t_end_ns: int) -> bool:
         """Whether all events before ``t_end_ns`` are known, or will not be waited for."""
@@ -213,10 +209,9 @@ class IngestStage:
         self._batch_t_ns = t_end_ns
         self.counters["batches"] += 1
         seq, memory_ns = self._batch_seq, self._memory_ns
-        left, right = (encode_ages(camera.first, t_end_ns, memory_ns) for camera in (self._left, self._right))
-        left_last, right_last = (
-            encode_newest(camera.last, t_end_ns, memory_ns) for camera in (self._left, self._right)
-        )
+        cameras = [(camera, camera.clock.stamp(t_end_ns)) for camera in (self._left, self._right)]
+        left, right = (encode_ages(camera.first, t_end, memory_ns) for camera, t_end in cameras)
+        left_last, right_last = (encode_newest(camera.last, t_end, memory_ns) for camera, t_end in cameras)
         noise_ns = self._noise_ns
         event_batches: list[EventBatch]
         if self._slices is None:
@@ -246,10 +241,11 @@ class IngestStage:
         """x, y, age, p, patch and ring of an EventBatch: the paper's rules go with the paper's 5x5 alone."""
         s, fit, memory_ns = self._settings.ingest, self._settings.flow, self._memory_ns
         quota = self.budget.quota(s.quota)
+        span = (self._left.clock.stamp(t_start_ns), self._left.clock.stamp(t_end_ns))
         if s.selection == "burst":
             surface = self._left.first
             x, y, p = select_burst(
-                surface, self._taken, encoded, t_start_ns, t_end_ns,
+                surface, self._taken, encoded, *span,
                 memory_ns=memory_ns, reject_px=fit.reject_px, rejections=fit.rejections,
                 min_neighbours=s.min_neighbours, max_rms_px=fit.max_rms_px,
                 border_px=s.border_px, quota=quota, seq=self._batch_seq, time_noise_s=1e-9 * self._noise_ns,
@@ -257,13 +253,13 @@ class IngestStage:
         else:
             surface = self._left.last
             x, y, p = select_paper(
-                surface, t_start_ns, t_end_ns,
+                surface, *span,
                 memory_ns=memory_ns, time_share=s.paper_time_share,
                 border_px=s.border_px, quota=quota, seq=self._batch_seq,
             )  # fmt: skip
         age, patch = np.empty(len(x), np.uint32), np.empty((len(x), SIZE), np.uint32)
         ring = np.empty((len(x) if s.selection == "burst" else 0, RING), np.uint32)
-        gather_patches(surface, x, y, p, t_end_ns, memory_ns, age, patch, ring)
+        gather_patches(surface, x, y, p, span[1], memory_ns, age, patch, ring)
         return x, y, age, p, patch, ring
 
     @property

@@ -6,17 +6,15 @@ from collections import Counter
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from velod.config import IngestSettings
 from velod.events.columns import readonly
-from velod.events.sae import NEVER, new_surface, update_sae
+from velod.events.sae import NEVER, update_sae
+from velod.events.surface_clock import SurfaceClock
 from velod.ingest.budget import BAND_ROWS
 from velod.ingest.drops import count_drops
 from velod.ingest.ordering import PacketOrder
-from velod.types import I64, NS_PER_S, U8, U16, EventPacket
-
-I32 = NDArray[np.int32]
+from velod.types import I32, I64, NS_PER_S, U8, U16, EventPacket
 
 DROPS = ("events.outside", "events.polarity", "events.backwards", "events.hot", "events.background", "shed.events")
 _OUTSIDE, _POLARITY, _BACKWARDS, _HOT, _BACKGROUND, _SHED = range(6)
@@ -69,12 +67,13 @@ class EventQueue:
 
 
 class CameraStream:
-    """Surfaces and queue of one camera; every event of it earlier than ``watermark_ns`` is known."""
+    """Surfaces, their clock and queue of one camera; every event of it earlier than ``watermark_ns`` is known."""
 
     def __init__(self, settings: IngestSettings, width: int, height: int, counters: Counter[str]) -> None:
         self.order: PacketOrder[EventPacket] = PacketOrder(counters)
-        self.first = new_surface(height, width)
-        self.last = new_surface(height, width)
+        self.clock = SurfaceClock(height, width)
+        self.first = self.clock.new_surface()
+        self.last = self.clock.new_surface()
         self.queue = EventQueue()
         self.watermark_ns = NEVER
         self._counters = counters
@@ -131,7 +130,10 @@ class CameraStream:
     def enter_before(self, t_ns: int) -> I64:
         """Move the queued events earlier than ``t_ns`` into the surfaces; returns their times."""
         x, y, t, p = self.take_before(t_ns)
-        update_sae(x, y, t, p, self.first, self.last, self.refractory_ns)
+        for part in self.clock.spans(t):
+            update_sae(
+                x[part], y[part], t[part], p[part], self.first, self.last, self.refractory_ns, self.clock.epoch_ns
+            )
         return t
 
 
