@@ -159,7 +159,6 @@ def test_one_that_works_with_something_else_or_that_nobody_wants_is_ended(
 
 def test_there_is_no_second_worker_of_the_name(service: Service) -> None:
     assert service.start() == "at work"
-    service.kill_supervisor()
     assert service.start() == "another process is flow-0 of this service already"
 
 

@@ -131,22 +131,27 @@ class _Ward:
     def _meet(self) -> None:
         """Somebody connects: a supervisor, or not."""
         connection, _ = self._listener.accept()
-        connection.settimeout(ANSWER_S)
-        try:
-            asked, files, _, _ = socket.recv_fds(connection, len(self._who) + 1, 1)
-            is_ours = self._guardian is None and peer_of(connection)[1] == os.getuid() and asked == self._who
-            if is_ours and files:
-                os.dup2(files[0], sys.stderr.fileno())
-            for file in files:
-                os.close(file)
-            connection.sendall(YES if is_ours else NO)
-        except OSError:  # gone again
-            connection.close()
-            return
-        if not is_ours:
-            connection.close()
-            return
-        signal.alarm(0)
-        connection.settimeout(None)
-        self._guardian = connection.detach()
+        with connection:
+            connection.settimeout(ANSWER_S)
+            try:
+                is_ours = self._is_ours(connection)
+                connection.sendall(YES if is_ours else NO)
+            except OSError:
+                return  # gone again
+            if not is_ours:
+                return
+            signal.alarm(0)
+            self._guardian = os.dup(connection.fileno())
         log.info("up, with another supervisor")
+
+    def _is_ours(self, connection: socket.socket) -> bool:
+        """Whether somebody is to be the supervisor; log lines then go to the file that comes along."""
+        if self._guardian is not None or peer_of(connection)[1] != os.getuid():
+            return False
+        asked, files, _, _ = socket.recv_fds(connection, len(self._who) + 1, 1)
+        is_ours = asked == self._who and len(files) == 1
+        if is_ours:
+            os.dup2(files[0], sys.stderr.fileno())
+        for file in files:
+            os.close(file)
+        return is_ours

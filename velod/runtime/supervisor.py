@@ -93,8 +93,8 @@ class Supervisor(Stacked):
         self._stages, self._worker, self._wants_spare = tuple(stages), worker, spare
         self._on_line = on_line
         # Whoever has the introducer's port is the only supervisor.
-        is_alone = not (settings.zenoh.connect or settings.zenoh.config)
-        self._outlive_s = outlive_s if is_alone else 0.0
+        self._is_alone = not (settings.zenoh.connect or settings.zenoh.config)
+        self._outlive_s = outlive_s if self._is_alone else 0.0
         self._slots: dict[str, _Slot] = {}
         self._further: list[_Slot] = []  # not yet started: a stage's second workers and so on
         self._spare: ChildProcess | None = None
@@ -214,11 +214,12 @@ class Supervisor(Stacked):
         return names
 
     def _left_behind(self, names: Sequence[str]) -> dict[str, AdoptedProcess]:
-        """Workers that a supervisor before this one has left at work."""
-        if not self._outlive_s or self._calibration is None:
+        """Workers that a supervisor before this one has left at work; none stays that is none of this one's."""
+        if not self._is_alone or self._calibration is None:
             return {}
         place = Place(introducer_endpoint(self._settings.zenoh), self._settings.rig.name)
-        adopted = adopt(place, names, identity(self._settings, self._calibration), self._on_line)
+        wanted = names if self._outlive_s else ()
+        adopted = adopt(place, wanted, identity(self._settings, self._calibration), self._on_line)
         for name, process in adopted.items():
             log.warning("%s: process %d, left at work by another supervisor, goes on", name, process.pid)
         return adopted
