@@ -348,7 +348,10 @@ def wait_for_lines(log: Path, text: str, times: int, within_s: float = 60.0) -> 
 def test_a_supervisor_that_is_killed_and_started_again_costs_no_velocity(
     slanted: Path, port: int, tmp_path: Path
 ) -> None:
-    """Its workers go on, and are the next one's; that one ends them in good order."""
+    """Its workers go on, and are the next one's; that one ends them in good order.
+
+    To start all anew takes 2.6 s at the least. Here a supervisor and a spare load beside work that goes on.
+    """
     zenoh, heard_s, ticks_ns = ZenohSettings(port=port), [], []
     player = [*player_command(str(slanted), zenoh, "rig0"), "--repeat", "inf"]
     with ExitStack() as stack:
@@ -371,8 +374,8 @@ def test_a_supervisor_that_is_killed_and_started_again_costs_no_velocity(
     log = (tmp_path / "second").read_text()
     assert log.count("left at work by another supervisor, goes on") == log.count("INFO up") == len(STAGES)
     assert not any("process" in line and "started" in line for line in log.splitlines())
-    assert np.diff(heard_s).max() <= 0.1 + 2.0 * stalls.longest_s
-    assert np.diff(ticks_ns).max() < 20_000_000
+    assert np.diff(heard_s).max() <= 0.3 + 2.0 * stalls.longest_s
+    assert np.diff(ticks_ns).max() <= 0.3e9 + 2e9 * stalls.longest_s
     assert second.returncode == 0
     assert are_gone(workers, within_s=1.0)
     assert "Traceback" not in log
