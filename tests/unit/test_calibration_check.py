@@ -20,7 +20,18 @@ from velod.io import open_recording
 from velod.optimizer.calibration_check import CLOCK, EVERY, ROWS, SCALE, CalibrationCheck
 from velod.optimizer.scale_check import SPAN_S, ScaleCheck, noise_of_span
 from velod.optimizer.stage import OptimizerStage
-from velod.optimizer.stereo_check import MIN_BATCHES, MOTION_SHARE, NEAR_PX, StereoCheck, _neighbours, _robust_sums
+from velod.optimizer.stereo_check import (
+    MIN_BATCHES,
+    MIN_PAIRS,
+    MOTION_OUTLIER,
+    MOTION_ROUNDS,
+    MOTION_SHARE,
+    NEAR_PX,
+    StereoCheck,
+    _fit_motion,
+    _neighbours,
+    _robust_sums,
+)
 from velod.types import F64, DepthBatch, EventBatch, EventPacket, FlowBatch, StereoBatch
 
 CAMERA = (260.0, 173.0, 130.0)
@@ -134,6 +145,35 @@ def test_the_kernels_are_their_plain_twins() -> None:
     np.testing.assert_allclose(h, h_twin, rtol=1e-9, atol=1e-9)
     assert noise == pytest.approx(float(w @ twin[:, 4]))
     assert weight == pytest.approx(float(w.sum()))
+
+
+def test_the_motion_is_that_of_least_squares_by_lapack_with_its_covariance_and_without_the_outliers() -> None:
+    rng = np.random.default_rng(2)
+    rows, sigma = rng.normal(size=(200, 6)) * [30.0, 20.0, 1.0, 300.0, 200.0, 50.0], rng.uniform(5.0, 20.0, 200)
+    speed = rows @ [1.0, -0.5, 2.0, 0.1, 0.3, -0.2] + sigma * rng.normal(size=200)
+    speed[:30] += 300.0
+    fit = _fit_motion(rows, speed, sigma)
+    assert fit is not None
+    kept = np.ones(200, bool)
+    for _ in range(MOTION_ROUNDS):
+        weighted = rows[kept] / sigma[kept, None]
+        twin = np.linalg.lstsq(weighted, speed[kept] / sigma[kept], rcond=None)[0]
+        off = np.abs(speed - rows @ twin) / sigma
+        scale = max(1.0, 1.5 * float(np.median(off)))
+        kept = off < MOTION_OUTLIER * scale
+    assert not kept[:30].any()
+    np.testing.assert_allclose(fit[0], twin, rtol=1e-9)
+    np.testing.assert_allclose(fit[1] @ fit[1].T, scale**2 * np.linalg.inv(weighted.T @ weighted), rtol=1e-9)
+
+
+@pytest.mark.parametrize("missing", ["flows", "a direction", "a combination"])
+def test_no_motion_where_the_flows_do_not_determine_it(missing: str) -> None:
+    rows = np.random.default_rng(3).normal(size=(MIN_PAIRS - 1 if missing == "flows" else 200, 6))
+    if missing == "a direction":
+        rows[:, 4] = 0.0
+    elif missing == "a combination":
+        rows[:, 4] = 2.0 * rows[:, 1] - rows[:, 5]
+    assert _fit_motion(rows, rows.sum(axis=1), np.ones(len(rows))) is None
 
 
 # --- on recordings that velod did not make

@@ -23,7 +23,9 @@ import numpy as np
 from numba import njit
 
 from velod.geometry.camera import motion_field_rows
+from velod.geometry.cholesky import backward, factorise, forward
 from velod.optimizer.flow_equation import pairs
+from velod.optimizer.small import median
 from velod.types import F64, DepthBatch, FlowBatch
 
 NEAR_PX = 12.0
@@ -34,6 +36,8 @@ MIN_PAIRS = 30
 ROUNDS = 5
 MOTION_ROUNDS, MOTION_OUTLIER = 4, 3.0
 """Rounds in which the image motion is fitted anew without the flows that are so many (robust) sigmas off."""
+LEAST_PIVOT = 1e-6
+"""A part of the motion that moves the flows by less, of what it would without the others, is not determined."""
 HELD = 120
 """Batches that count, a few seconds."""
 MIN_BATCHES = 12
@@ -132,19 +136,59 @@ def _fit_motion(rows: F64, speed: F64, sigma: F64) -> tuple[F64, F64] | None:
 
     None where the flows do not determine it.
     """
-    kept = np.ones(len(speed), np.bool_)
+    motion, L, scale = np.zeros(6), np.empty((6, 6)), np.empty(6)
+    sigmas = _reweighted_motion(rows, speed, 1.0 / sigma, motion, L, scale)
+    if not sigmas > 0.0:
+        return None
+    root: F64 = sigmas * np.linalg.inv(L).T / scale[:, None]
+    return motion, root
+
+
+@njit(cache=True, nogil=True)
+def _reweighted_motion(rows: F64, speed: F64, per_sigma: F64, motion: F64, L: F64, scale: F64) -> float:
+    """Rounds of least squares without outliers; returns the robust size of a residual in sigmas, 0 where it fails.
+
+    The normal equations, ``scale`` (6,) taken out on both sides, are L L^T (6, 6).
+    """
+    m, n = rows.shape
+    off, size, limit = np.zeros(m), np.empty(m), 1.0
     for _ in range(MOTION_ROUNDS):
-        if np.count_nonzero(kept) < MIN_PAIRS:
-            return None
-        weighted = rows[kept] / sigma[kept, None]
-        motion, _, rank, _ = np.linalg.lstsq(weighted, speed[kept] / sigma[kept], rcond=1e-9)
-        if rank < rows.shape[1]:
-            return None
-        off = np.abs(speed - rows @ motion) / sigma
-        scale = max(1.0, 1.5 * float(np.median(off)))
-        kept = off < MOTION_OUTLIER * scale
-    root: F64 = scale * np.linalg.inv(np.linalg.cholesky(weighted.T @ weighted)).T
-    return np.asarray(motion), root
+        L[:] = 0.0
+        motion[:] = 0.0
+        kept = 0
+        for k in range(m):
+            if off[k] < limit:
+                kept += 1
+                w = per_sigma[k] * per_sigma[k]
+                for i in range(n):
+                    motion[i] += w * rows[k, i] * speed[k]
+                    for j in range(i + 1):
+                        L[i, j] += w * rows[k, i] * rows[k, j]
+        for i in range(n):
+            scale[i] = math.sqrt(L[i, i])
+        if kept < MIN_PAIRS or not scale.min() > 0.0:
+            return 0.0
+        for i in range(n):
+            motion[i] /= scale[i]
+            for j in range(i + 1):
+                L[i, j] /= scale[i] * scale[j]
+        factorise(L)
+        for i in range(n):
+            if not L[i, i] > LEAST_PIVOT:
+                return 0.0
+        forward(L, motion)
+        backward(L, motion)
+        for i in range(n):
+            motion[i] /= scale[i]
+        for k in range(m):
+            predicted = 0.0
+            for i in range(n):
+                predicted += rows[k, i] * motion[i]
+            off[k] = abs(speed[k] - predicted) * per_sigma[k]
+            size[k] = off[k]
+        sigmas = max(1.0, 1.5 * median(size))
+        limit = MOTION_OUTLIER * sigmas
+    return sigmas
 
 
 @njit(cache=True, nogil=True)
