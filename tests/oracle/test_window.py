@@ -10,8 +10,8 @@ from scipy.optimize import least_squares
 from tests.synthetic import CALIBRATION, FLIGHT, Motion, messages
 from velod.config import ImuSettings, Settings, from_tree
 from velod.geometry.so3 import exp, hat
+from velod.optimizer.bins import BIN_NS
 from velod.optimizer.estimator import Estimator
-from velod.optimizer.flow_equation import BIN_NS
 from velod.optimizer.head import Head
 from velod.optimizer.interval import BLOCK, HEAD, Interval
 from velod.optimizer.preintegration import preintegrate

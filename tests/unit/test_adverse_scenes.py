@@ -12,7 +12,8 @@ from velod.config import Settings
 from velod.depth import stage as module
 from velod.depth.stage import DepthStage
 from velod.geometry.rectify import rectify
-from velod.optimizer.flow_equation import Measured, body_rows, on_velocity, solve_weighted
+from velod.optimizer.batch_fit import solve_weighted
+from velod.optimizer.flow_equation import Measured, body_rows, on_velocity
 from velod.types import DepthBatch, StereoBatch
 
 F_B = 20.0

@@ -6,8 +6,9 @@ from scipy import linalg
 
 from tests.synthetic import CALIBRATION, Motion, errors, messages
 from velod.config import from_tree
+from velod.optimizer.batch_fit import Fit
 from velod.optimizer.degeneracy import TRUSTED, complement, open_directions, weak_directions, without
-from velod.optimizer.flow_equation import Fit, Measured, Rows
+from velod.optimizer.flow_equation import Measured, Rows
 from velod.optimizer.stage import OptimizerStage
 from velod.types import Velocity
 

@@ -4,22 +4,17 @@ import numpy as np
 
 from velod.geometry.camera import motion_field_rows
 from velod.geometry.so3 import exp
+from velod.optimizer.batch_fit import Fit, solve, solve_weighted, turn_sensitivity
+from velod.optimizer.bins import BIN_NS, Bins, compress
 from velod.optimizer.flow_equation import (
-    BIN_NS,
     MODEL_SIGMA_PX_S,
     PREDICTED_SHARE,
-    Bins,
-    Fit,
     Measured,
     Rows,
     body_rows,
-    compress,
     less_known,
     pairs,
     sigmas,
-    solve,
-    solve_weighted,
-    turn_sensitivity,
 )
 
 

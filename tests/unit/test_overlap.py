@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 from velod.config import IngestSettings
-from velod.optimizer.flow_equation import Rows, compress, solve
+from velod.optimizer.batch_fit import solve
+from velod.optimizer.bins import compress
+from velod.optimizer.flow_equation import Rows
 from velod.optimizer.overlap import counted_once, times_seen
 
 INGEST = IngestSettings(period_ms=10.0, memory_ms=100.0)

@@ -8,7 +8,7 @@ import pytest
 from tests.synthetic import CALIBRATION, FLIGHT, SPIN, Motion, Shaking, messages
 from velod.config import from_tree
 from velod.geometry.so3 import exp
-from velod.optimizer.flow_equation import BIN_NS, Bins
+from velod.optimizer.bins import BIN_NS, Bins
 from velod.optimizer.rotation_check import FAR_NS, NEAR_NS, RotationCheck
 from velod.optimizer.stage import OptimizerStage
 from velod.types import ImuSamples, Velocity

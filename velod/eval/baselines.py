@@ -13,7 +13,7 @@ from velod.eval.metrics import interpolated
 from velod.geometry.calibration import Calibration
 from velod.geometry.rectify import rectify
 from velod.io.model import Imu, Truth
-from velod.optimizer import flow_equation
+from velod.optimizer import batch_fit, flow_equation
 from velod.optimizer.inertial import InertialMemory
 from velod.types import F64, I64, NS_PER_S, ImuSamples, TrackingState, Velocity
 
@@ -68,7 +68,7 @@ def solve_linear(front_end: FrontEnd, settings: Settings, calibration: Calibrati
             speed, flow.sigma.astype(np.float64), rows.z, depth.sigma / depth.inv_depth.astype(np.float64)
         )
         seed = settings.optimizer.seed + flow.seq
-        fit = flow_equation.solve_weighted(rows, measured, settings.optimizer.ransac_iterations, seed)
+        fit = batch_fit.solve_weighted(rows, measured, settings.optimizer.ransac_iterations, seed)
         if fit is not None:
             velocities.append(_velocity(len(velocities), flow.t_ns, fit.e, fit.cov))
     return velocities

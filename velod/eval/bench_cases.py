@@ -26,8 +26,10 @@ from velod.events.sensor_size import for_sensor
 from velod.events.surface_clock import SurfaceClock
 from velod.flow.stage import FlowStage
 from velod.ingest.stage import IngestStage
+from velod.optimizer.batch_fit import Fit, solve
+from velod.optimizer.bins import compress
 from velod.optimizer.estimator import Estimator
-from velod.optimizer.flow_equation import Fit, Rows, body_rows, compress, on_velocity, solve
+from velod.optimizer.flow_equation import Rows, body_rows, on_velocity
 from velod.optimizer.interval import BLOCK
 from velod.optimizer.stage import OptimizerStage
 from velod.optimizer.window import Window

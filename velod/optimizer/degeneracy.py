@@ -10,7 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from velod.optimizer.flow_equation import Fit, Measured, Rows
+from velod.optimizer.batch_fit import Fit
+from velod.optimizer.flow_equation import Measured, Rows
 from velod.types import F64
 
 TRUSTED = 3.0

@@ -11,13 +11,15 @@ from velod.events.sae import NEVER
 from velod.events.sensor_size import for_sensor
 from velod.geometry.calibration import Calibration
 from velod.geometry.rectify import rectified_pair
-from velod.optimizer import attitude, degeneracy, flow_equation, inertial_residual, overlap
+from velod.optimizer import attitude, batch_fit, degeneracy, inertial_residual, overlap
 from velod.optimizer.attitude import Attitude
+from velod.optimizer.batch_fit import RIDGE, Fit
 from velod.optimizer.bias_prior import EXCESSIVE, implausible, likely_margins
+from velod.optimizer.bins import BIN_NS, Bins, compress
 from velod.optimizer.consistency import Consistency
 from velod.optimizer.depth_share import Probation, cameras_disagree
 from velod.optimizer.equations import EquationMaker, Equations, Prediction
-from velod.optimizer.flow_equation import BIN_NS, COMMON, RIDGE, Bins, Fit, Rows
+from velod.optimizer.flow_equation import COMMON, Rows, less_known, span
 from velod.optimizer.frame import Rate
 from velod.optimizer.head import Head
 from velod.optimizer.imu_noise import ImuNoise
@@ -350,13 +352,13 @@ class Estimator:
         common, predicted_e = np.zeros(3), np.zeros(3)
         if self.head is not None:
             common, predicted_e = self.head.common, self.head.e_at(t_ns)
-        still = flow_equation.less_known(on_error, equations.common, common, -self._gravity(), predicted_e, t_ns)
+        still = less_known(on_error, equations.common, common, -self._gravity(), predicted_e, t_ns)
         iterations, seed = self._o.ransac_iterations, self._o.seed + t_ns // 1000
         if self._o.weights == "fixed":
             still.sigma[:] = self._o.fixed_sigma_px_s
-            fit = flow_equation.solve(still, iterations, seed, RIDGE)
+            fit = batch_fit.solve(still, iterations, seed, RIDGE)
         else:
-            fit = flow_equation.solve_weighted(still, measured, iterations, seed, RIDGE)
+            fit = batch_fit.solve_weighted(still, measured, iterations, seed, RIDGE)
         return None if fit is None else replace(fit, e=fit.e + predicted_e)
 
     def _start(self, t_ns: int, until_ns: int) -> None:
@@ -426,7 +428,7 @@ class Estimator:
         if self._o.weights == "propagated":
             times = overlap.times_seen(equations.measured.speed, self._ingest)
             on_spline = overlap.counted_once(on_spline, times)
-        bins = flow_equation.compress(on_spline, equations.common, fit, shared, self._slope())
+        bins = compress(on_spline, equations.common, fit, shared, self._slope())
         if not len(weak_L) and predicted is not None and self.head is not None:
             R_LB, _ = self.memory.frame_at(t_ns)
             cov_e = R_LB @ predicted[1] @ R_LB.T
@@ -486,9 +488,9 @@ class Estimator:
             return 3.0
         R_LB, s_L = self.memory.frame_at(t_ns)
         d = s_L + fit.e - R_LB @ predicted[0]
-        start_ns, end_ns = flow_equation.span(rows.t_ns)
+        start_ns, end_ns = span(rows.t_ns)
         seen_s = max(end_ns - start_ns, BIN_NS) * 1e-9
-        turned = flow_equation.turn_sensitivity(rows, fit) * self._imu.gyro_noise
+        turned = batch_fit.turn_sensitivity(rows, fit) * self._imu.gyro_noise
         S = fit.cov * self._o.shared_error + turned @ turned.T / seen_s + R_LB @ predicted[1] @ R_LB.T
         if len(weak_L):
             seen = degeneracy.complement(weak_L)

@@ -14,8 +14,8 @@ from numba import njit
 
 from velod.events.plane_fit import ANY_ORDER
 from velod.optimizer import inertial_residual
+from velod.optimizer.bins import BIN_NS, Bins
 from velod.optimizer.envelope import factorise, forward
-from velod.optimizer.flow_equation import BIN_NS, Bins
 from velod.optimizer.preintegration import Preintegration
 from velod.optimizer.spline import fill_basis
 from velod.types import F64, I64

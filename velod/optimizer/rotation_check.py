@@ -22,7 +22,7 @@ import numpy as np
 from numba import njit
 
 from velod.geometry.so3 import log_so3
-from velod.optimizer.flow_equation import BIN_NS, Bins
+from velod.optimizer.bins import BIN_NS, Bins
 from velod.optimizer.inertial import InertialMemory
 from velod.optimizer.small import invert3, multiply
 from velod.types import F64, NS_PER_S

@@ -21,7 +21,7 @@ from numba import njit
 from velod.config import ImuSettings
 from velod.geometry.so3 import hat
 from velod.optimizer import envelope
-from velod.optimizer.flow_equation import BIN_NS
+from velod.optimizer.bins import BIN_NS
 from velod.optimizer.interval import BLOCK, HEAD, Interval
 from velod.optimizer.spline import fill_basis, locate
 from velod.types import F64, I64
