@@ -45,7 +45,7 @@ def _left_behind(place: Place) -> list[str]:
 
 
 def _take(address: str, who: bytes, on_line: LineSink) -> AdoptedProcess | None:
-    """The worker that listens there; None where it is none for us, and has been ended, or is gone."""
+    """The worker that listens there, if it works with ``who``; None where it did not and was ended, or is gone."""
     connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     connection.settimeout(ANSWER_S)
     try:
@@ -59,20 +59,29 @@ def _take(address: str, who: bytes, on_line: LineSink) -> AdoptedProcess | None:
         connection.close()
         return None
     lines, theirs = os.pipe()
+    agreed = bool(who) and _agrees(connection, who, theirs)
+    os.close(theirs)
+    if agreed:
+        return AdoptedProcess(pid, process, connection, os.fdopen(lines, errors="replace"), on_line)
+    log.warning("process %d, left at work by another supervisor, is none for this one: ended", pid)
+    _end(process)
+    os.close(lines)
+    connection.close()
+    return None
+
+
+def _agrees(connection: socket.socket, who: bytes, log_file: int) -> bool:
+    """Whether the worker takes us for its supervisor; its log lines go to ``log_file`` then."""
     try:
-        socket.send_fds(connection, [who or b"-"], [theirs])
-        if connection.recv(len(YES)) == YES:
-            return AdoptedProcess(pid, process, connection, os.fdopen(lines, errors="replace"), on_line)
-    except OSError:
-        log.debug("process %d does not answer", pid)
-    finally:
-        os.close(theirs)
-    log.warning("process %d, left behind by another supervisor, is none for this one: ended", pid)
+        socket.send_fds(connection, [who], [log_file])
+        return connection.recv(len(YES)) == YES
+    except OSError:  # it hangs, or has ended
+        return False
+
+
+def _end(process: int) -> None:
     signal.pidfd_send_signal(process, signal.SIGKILL)
     gone = select.poll()
     gone.register(process, select.POLLIN)
     gone.poll(1e3 * ANSWER_S)
-    for file in (process, lines):
-        os.close(file)
-    connection.close()
-    return None
+    os.close(process)
