@@ -29,16 +29,16 @@ pytestmark = [
 WORKER = """
 import logging, sys
 from threading import Event
-from velod.runtime.custody import Place, custody
+from velod.runtime.custody import Place, live_in_custody
 from velod.runtime.parent import die_with
 logging.basicConfig(level=logging.INFO)
 endpoint, parent, wait_s = sys.argv[1], int(sys.argv[2]), float(sys.argv[3])
 die_with(parent)
 stop = Event()
 try:
-    with custody(Place(endpoint, "rig0"), "flow-0", parent, wait_s, b"what it works with", stop):
-        print("at work", flush=True)
-        stop.wait(60.0)
+    live_in_custody(Place(endpoint, "rig0"), "flow-0", parent, wait_s, b"what it works with", stop)
+    print("at work", flush=True)
+    stop.wait(60.0)
 except OSError as e:
     print(e, flush=True)
 """

@@ -18,8 +18,6 @@ import socket
 import struct
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from threading import Event, Thread
 from typing import Final
@@ -72,26 +70,24 @@ def peer_of(connection: socket.socket) -> tuple[int, int]:
     return pid, uid
 
 
-@contextmanager
-def custody(place: Place, worker: str, parent: int, wait_s: float, who: bytes, stop: Event) -> Iterator[None]:
-    """Be ``worker``, and outlive ``parent`` by ``wait_s`` or until another supervisor's end, as long as this lasts.
+def live_in_custody(place: Place, worker: str, parent: int, wait_s: float, who: bytes, stop: Event) -> None:
+    """Be ``worker`` from now on, and outlive ``parent`` by ``wait_s``, or until the end of another supervisor.
 
     ``stop`` is set when nobody has come. Does nothing where ``wait_s`` is 0, and elsewhere than on Linux. Raises
     OSError where another process is this worker already.
     """
     if not wait_s or sys.platform != "linux":
-        yield
         return
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
-        try:
-            listener.bind(place.address(worker))
-        except OSError:
-            raise OSError(f"another process is {worker} of this service already") from None
-        listener.listen()
-        outlive()
-        ward = _Ward(listener, os.pidfd_open(parent), wait_s, who, stop)
-        Thread(target=ward.watch, name="custody", daemon=True).start()
-        yield
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)  # open, and the name taken, while the process lives
+    try:
+        listener.bind(place.address(worker))
+    except OSError:
+        listener.close()
+        raise OSError(f"another process is {worker} of this service already") from None
+    listener.listen()
+    outlive()
+    ward = _Ward(listener, os.pidfd_open(parent), wait_s, who, stop)
+    Thread(target=ward.watch, name="custody", daemon=True).start()
 
 
 class _Ward:
@@ -116,7 +112,6 @@ class _Ward:
                 self._lose_guardian()
             if self._listener.fileno() in ready:
                 self._meet()
-        log.warning("no supervisor has come: ending")
         self._stop.set()
 
     def _lose_guardian(self) -> None:

@@ -63,8 +63,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             name = args.worker or _wait_for_order(stop)
             if name:
                 worker.start_logging(name)
-                with worker.in_custody(args, name, identity(settings, calibration), stop):
-                    worker.serve_stage(session, settings, name, stages[stage_of(name)], stop)
+                worker.enter_custody(args, name, identity(settings, calibration), stop)
+                worker.serve_stage(session, settings, name, stages[stage_of(name)], stop)
     except (OSError, ValueError) as e:
         worker.log.error("%s", e)
         return worker.EXIT_USAGE

@@ -10,14 +10,13 @@ import signal
 import socket
 import sys
 from collections.abc import Sequence
-from contextlib import AbstractContextManager
 from threading import Event, Thread
 
 import zenoh
 
 from velod.config import Settings, ZenohSettings
 from velod.runtime.access import ROLES
-from velod.runtime.custody import Place, custody, identity
+from velod.runtime.custody import Place, identity, live_in_custody
 from velod.runtime.heap import keep_memory
 from velod.runtime.kernel_cache import ensure_cache_directory
 from velod.runtime.parent import die_with
@@ -46,8 +45,8 @@ def main(stage: str, argv: Sequence[str] | None = None) -> int:
             settings, calibration = fetch(session, args.rig, args.connect)
             built = create_stage(stage, settings, calibration)
             warmup.warm_up(stage, settings, calibration)
-            with in_custody(args, args.worker, identity(settings, calibration), stop):
-                serve_stage(session, settings, args.worker, built, stop)
+            enter_custody(args, args.worker, identity(settings, calibration), stop)
+            serve_stage(session, settings, args.worker, built, stop)
     except (OSError, ValueError) as e:
         log.error("%s", e)
         return EXIT_USAGE
@@ -65,9 +64,9 @@ def serve_stage(session: zenoh.Session, settings: Settings, worker: str, stage: 
     SHELLS[name](session, settings, name, worker, stage).run(stop)
 
 
-def in_custody(args: argparse.Namespace, worker: str, who: bytes, stop: Event) -> AbstractContextManager[None]:
-    """The custody of a worker that was started with these arguments."""
-    return custody(Place(args.connect, args.rig), worker, args.parent, args.outlive, who, stop)
+def enter_custody(args: argparse.Namespace, worker: str, who: bytes, stop: Event) -> None:
+    """Be a worker that outlives its supervisor, if the arguments say so. Raises OSError where it is there already."""
+    live_in_custody(Place(args.connect, args.rig), worker, args.parent, args.outlive, who, stop)
 
 
 def worker_arguments(settings: ZenohSettings, rig: str, worker: str, outlive_s: float = 0.0) -> list[str]:
