@@ -78,7 +78,8 @@ def is_loopback(host: str) -> bool:
 def refuse_what_is_open(config: zenoh.Config, source: str) -> None:
     """Raise SessionError where a configuration lets others than this host in, or goes out, without certificates."""
     mode = _get(config, "mode") or "peer"
-    for what in ("listen", "connect"):
+    # What was asked for first: where a peer listens may follow from where it connects.
+    for what in ("connect", "listen"):
         if what == "listen" and mode == "client":
             continue  # a client listens to nobody, whatever is configured
         for endpoint in _endpoints(_get(config, f"{what}/endpoints"), mode):
@@ -89,7 +90,8 @@ def refuse_what_is_open(config: zenoh.Config, source: str) -> None:
             if protocol not in _GUARDED:
                 raise SessionError(
                     f"{source}: {what} {endpoint} reaches beyond this host without certificates: use tls/ and "
-                    f"zenoh.keys (`velod config keys`), or zenoh.insecure = true to be open to everyone there"
+                    "zenoh.keys (`velod config keys`), or zenoh.insecure = true (--insecure) to be open to everyone "
+                    "there"
                 )
             _refuse_half_guarded(config, what, f"{source}: {what} {endpoint}")
     if _get(config, "scouting/multicast/enabled") is not False and mode != "client":

@@ -86,7 +86,7 @@ class Supervisor(Stacked):
         if unknown or not stages:
             raise ValueError(f"unknown stage {', '.join(sorted(unknown))}; stages: {', '.join(STAGES)}")
         if worker and tuple(stages) != (stage_of(worker),):
-            raise ValueError(f"worker {worker}: goes with its one stage, {stage_of(worker)}")
+            raise ValueError(f"worker {worker}: goes with its one stage: --only {stage_of(worker)}")
         if calibration is None and not settings.zenoh.connect:
             raise ValueError("a calibration is needed where no other service is connected to (rig.calibration)")
         self._settings, self._calibration = settings, calibration
