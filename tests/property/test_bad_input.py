@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests import slanted_scene
-from velod.geometry.calibration import CalibrationError, load_calibration
+from velod.geometry.calibration import CalibrationError
+from velod.geometry.calibration_files import load_calibration
 from velod.io import RecordingError, open_recording
 from velod.prove.examples import example_messages
 from velod.prove.fuzz import fuzz

@@ -17,7 +17,7 @@ import numpy as np
 from tests.system.hosts import Host, Network
 from velod import config
 from velod.config import Settings
-from velod.geometry.calibration import save_calibration
+from velod.geometry.calibration_files import save_calibration
 from velod.io import Recording, open_recording
 
 CONSUMER = Path(__file__).with_name("consumer.py")

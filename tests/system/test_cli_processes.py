@@ -17,7 +17,7 @@ import pytest
 
 from tests import slanted_scene
 from velod.cli import main
-from velod.geometry.calibration import save_calibration
+from velod.geometry.calibration_files import save_calibration
 
 pytestmark = pytest.mark.system
 VELOD = [sys.executable, "-P", "-m", "velod.cli"]

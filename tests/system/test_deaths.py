@@ -19,7 +19,7 @@ from tests.system.rig import Stalls
 from velod import config
 from velod.client import VelocityClient
 from velod.config import FlowSettings, RigSettings, Settings, ZenohSettings
-from velod.geometry.calibration import save_calibration
+from velod.geometry.calibration_files import save_calibration
 from velod.io import open_recording
 from velod.runtime.online import OnlineResult, run_online
 from velod.runtime.player import player_command

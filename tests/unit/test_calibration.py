@@ -10,7 +10,8 @@ import pytest
 import yaml
 
 from velod.geometry import so3
-from velod.geometry.calibration import Calibration, CalibrationError, Camera, load_calibration, save_calibration
+from velod.geometry.calibration import Calibration, CalibrationError, Camera
+from velod.geometry.calibration_files import load_calibration, save_calibration
 
 DATA = Path(__file__).parents[2] / ".." / "shared" / "data" / "calib"
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="no calibrations in ../shared/data/calib")

@@ -22,7 +22,7 @@ from velod import config
 from velod.cli import main
 from velod.config import Settings
 from velod.eval.metrics import truth_at
-from velod.geometry.calibration import load_calibration, save_calibration
+from velod.geometry.calibration_files import load_calibration, save_calibration
 from velod.io import open_recording
 from velod.sim import Sequence
 

@@ -13,7 +13,7 @@ import pytest
 
 from velod.cli import main
 from velod.config import DepthSettings, Settings, ZenohSettings
-from velod.geometry.calibration import save_calibration
+from velod.geometry.calibration_files import save_calibration
 from velod.prove.besieged import free_port
 from velod.runtime import checkup
 from velod.runtime.certificates import make_keys

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from velod.config import Settings
-from velod.geometry.calibration import load_calibration
+from velod.geometry.calibration_files import load_calibration
 from velod.runtime.offline import run_offline
 from velod.types import EventPacket, ImuPacket
 from velod.wire import decode

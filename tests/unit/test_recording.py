@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 import yaml
 
-from velod.geometry.calibration import Calibration, CalibrationError, Camera, save_calibration
+from velod.geometry.calibration import Calibration, CalibrationError, Camera
+from velod.geometry.calibration_files import save_calibration
 from velod.io import (
     EventColumns,
     Imu,

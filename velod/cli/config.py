@@ -24,7 +24,7 @@ def calibration_of(settings: Settings) -> Calibration | None:
     """The calibration that the settings name, if they do. Raises CalibrationError."""
     if not settings.rig.calibration:
         return None
-    from velod.geometry.calibration import load_calibration
+    from velod.geometry.calibration_files import load_calibration
 
     return load_calibration(settings.rig.calibration)
 
@@ -65,7 +65,7 @@ def calibration(path: str, imu_path: str | None) -> int:
     """Read a calibration of any known kind and print it as velod's own YAML."""
     import yaml
 
-    from velod.geometry.calibration import load_calibration
+    from velod.geometry.calibration_files import load_calibration
 
     yaml.safe_dump(load_calibration(path, imu_path).to_tree(), sys.stdout, sort_keys=False)
     return 0

@@ -17,7 +17,8 @@ from velod.cli.line import Line
 from velod.cli.place import Place, Way, place_of
 from velod.cli.values import require_writable
 from velod.client import Listener, Received
-from velod.geometry.calibration import Calibration, CalibrationError, save_calibration
+from velod.geometry.calibration import Calibration, CalibrationError
+from velod.geometry.calibration_files import save_calibration
 from velod.io.live import SensorLog
 from velod.io.model import RecordingError
 from velod.runtime.session import open_session

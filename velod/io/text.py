@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from velod.geometry.calibration import Calibration, CalibrationError, load_calibration
+from velod.geometry.calibration import Calibration, CalibrationError
+from velod.geometry.calibration_files import load_calibration
 from velod.io.hdf5 import pixels, polarities
 from velod.io.model import EventColumns, Imu, Parts, RecordingError, Truth
 from velod.types import F64, I64

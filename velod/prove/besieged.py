@@ -22,7 +22,7 @@ import zenoh
 from velod import config
 from velod.client import Listener, VelocityClient
 from velod.config import RigSettings, Settings, ZenohSettings
-from velod.geometry.calibration import save_calibration
+from velod.geometry.calibration_files import save_calibration
 from velod.io import open_recording
 from velod.runtime.certificates import make_keys
 from velod.runtime.key_paths import KeyPaths

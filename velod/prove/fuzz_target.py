@@ -18,9 +18,10 @@ from typing import Any
 import atheris
 import msgpack
 
-with atheris.instrument_imports(include=["velod.wire", "velod.config", "velod.geometry.calibration"]):
+with atheris.instrument_imports(include=["velod.wire", "velod.config", "velod.geometry"]):
     from velod import config
-    from velod.geometry import calibration
+    from velod.geometry import calibration_files
+    from velod.geometry.calibration import CalibrationError
     from velod.wire import WireError, codec, topics
 
 from velod.prove.examples import example_messages, plain_rig
@@ -55,8 +56,8 @@ def read_calibration(data: bytes) -> None:
     """A calibration file of any kind."""
     _SCRATCH.write_bytes(data)
     try:
-        calibration.load_calibration(_SCRATCH)
-    except calibration.CalibrationError:
+        calibration_files.load_calibration(_SCRATCH)
+    except CalibrationError:
         return
 
 
@@ -85,7 +86,7 @@ def seeds(decoder: str) -> list[bytes]:
     if decoder == "settings":
         return [config.to_toml(config.Settings(), explain=False).encode()]
     if decoder == "calibration":
-        calibration.save_calibration(_SCRATCH, plain_rig())
+        calibration_files.save_calibration(_SCRATCH, plain_rig())
         return [_SCRATCH.read_bytes()]
     return [topic.template.format(rig="rig0", camera="left", stage="flow", worker="flow-0").encode()
             for topic in topics.TOPICS.values()]  # fmt: skip

@@ -16,7 +16,8 @@ from typing import Literal
 
 from velod.config import DepthSettings, ZenohSettings
 from velod.events.sensor_size import max_disparity_px
-from velod.geometry.calibration import Calibration, CalibrationError, Camera, load_calibration
+from velod.geometry.calibration import Calibration, CalibrationError, Camera
+from velod.geometry.calibration_files import load_calibration
 from velod.runtime.access import ROLES, SERVER
 from velod.runtime.endpoints import SessionError
 from velod.runtime.kernel_cache import cache_directory, ensure_cache_directory, kept_kernels, package_directory

@@ -18,7 +18,7 @@ from threading import Condition, Event
 import zenoh
 
 from velod.config import ZenohSettings
-from velod.geometry.calibration import load_calibration
+from velod.geometry.calibration_files import load_calibration
 from velod.io import open_recording
 from velod.io.packets import Chunking, repeated
 from velod.runtime.callbacks import direct
