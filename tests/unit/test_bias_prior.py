@@ -27,26 +27,55 @@ def data(rng, times, seen=0.5):
     return cov, times * SIGMA * rng.normal(size=6) + mixed @ rng.normal(size=6)
 
 
-def found(cov, value, margins=(1.0, 1.0)):
-    """Margins from the estimate that these data and a prior with ``margins`` make."""
+def estimate(cov, value, margins):
+    """Biases (6,) and their covariance (6, 6) from data and a prior with ``margins``."""
     prior = (np.repeat(margins, 3) * SIGMA) ** 2 + WALKED
     both = np.linalg.inv(np.linalg.inv(cov) + np.diag(1.0 / prior))
-    return likely_margins(both @ np.linalg.solve(cov, value), both, SIGMA, WALKED, margins)
+    return both @ np.linalg.solve(cov, value), both
 
 
-def test_a_margin_is_its_mean_under_the_density_of_the_data():
-    """Against scipy's density of what the data say: the biases' prior and the data's own noise together."""
-    cov, value = data(np.random.default_rng(1), 5.0)
-    log_margins, total = np.zeros(2), 0.0
+def found(cov, value, margins=(1.0, 1.0)):
+    """Margins from the estimate that these data and a prior with ``margins`` make."""
+    return likely_margins(*estimate(cov, value, margins), SIGMA, WALKED, margins).margins
+
+
+def weighted_pairs(cov, value):
+    """Every pair of margins with scipy's density of the data: the biases' prior and the data's own noise together."""
     for accel in MARGINS:
         for gyro in MARGINS:
             prior = (np.repeat([accel, gyro], 3) * SIGMA) ** 2 + WALKED
             weight = multivariate_normal(np.zeros(6), np.diag(prior) + cov).pdf(value)
             for margin in (accel, gyro):
                 weight *= AS_SPECIFIED if margin == 1.0 else (1.0 - AS_SPECIFIED) / (len(MARGINS) - 1)
-            log_margins += weight * np.log([accel, gyro])
-            total += weight
-    assert np.allclose(np.log(found(cov, value)), log_margins / total, rtol=1e-6)
+            yield weight, (accel, gyro)
+
+
+def test_a_margin_is_its_mean_under_the_density_of_the_data():
+    cov, value = data(np.random.default_rng(1), 5.0)
+    weights, pairs = zip(*weighted_pairs(cov, value), strict=True)
+    assert np.allclose(np.log(found(cov, value)), np.average(np.log(pairs), axis=0, weights=weights), rtol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_with_the_doubt_the_covariance_is_that_of_all_margins_together(seed):
+    """Second moments of the estimates with each about that with the margins in use; never less than its own."""
+    cov, value = data(np.random.default_rng(seed), 3.0)
+    likely = likely_margins(*estimate(cov, value, (2.0, 1.0)), SIGMA, WALKED, (2.0, 1.0))
+    used, used_cov = estimate(cov, value, likely.margins)
+    weights, moments = [], []
+    for weight, margins in weighted_pairs(cov, value):
+        biases, own = estimate(cov, value, margins)
+        weights.append(weight)
+        moments.append(own + np.outer(biases - used, biases - used))
+    lacking = np.average(moments, axis=0, weights=weights) - used_cov
+    values, vectors = np.linalg.eigh(lacking)
+    assert np.allclose(likely.doubt, (vectors * np.maximum(values, 0.0)) @ vectors.T, rtol=1e-6, atol=1e-12)
+
+
+def test_data_that_are_certain_leave_no_doubt():
+    cov, value = data(np.random.default_rng(5), 8.0, seen=1e-3)
+    likely = likely_margins(*estimate(cov, value, (8.0, 8.0)), SIGMA, WALKED, (8.0, 8.0))
+    assert np.abs(likely.doubt).max() < 1e-3 * np.diag(cov).max()
 
 
 def test_what_is_found_does_not_depend_on_the_prior_that_was_used():
@@ -58,7 +87,9 @@ def test_what_is_found_does_not_depend_on_the_prior_that_was_used():
 
 def test_a_covariance_that_is_none_by_rounding_leaves_the_prior_as_it_is():
     cov, value = data(np.random.default_rng(3), 5.0)
-    assert likely_margins(value, -cov, SIGMA, WALKED, (2.0, 3.0)) == (2.0, 3.0)
+    likely = likely_margins(value, -cov, SIGMA, WALKED, (2.0, 3.0))
+    assert likely.margins == (2.0, 3.0)
+    assert not likely.doubt.any()
 
 
 def test_data_that_say_nothing_leave_the_prior_as_it_is():

@@ -8,6 +8,7 @@ gyroscope have an unknown margin each on their sigmas. It is 1 unless the data a
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
@@ -32,10 +33,17 @@ _EACH = np.repeat(_PAIRS, 3, axis=1)  # (pairs, 6), of b_a and b_w
 _LOG_PRIOR = np.log(np.where(_PAIRS == 1.0, AS_SPECIFIED, (1.0 - AS_SPECIFIED) / (len(MARGINS) - 1))).sum(axis=1)
 
 
-def likely_margins(
-    biases: F64, cov: F64, sigma: F64, walked: F64, margins: tuple[float, float]
-) -> tuple[float, float]:
-    """Margins of b_a and b_w on the specified ``sigma`` (6,) of the start: the mean of their logarithms.
+@dataclass(frozen=True, slots=True)
+class Likely:
+    """What the data say of the margins."""
+
+    margins: tuple[float, float]  # on the sigmas of b_a and b_w: the mean of their logarithms
+    information: F64  # (6, 6) of the biases with them
+    doubt: F64  # (6, 6) what the biases' covariance lacks, since other margins are possible
+
+
+def likely_margins(biases: F64, cov: F64, sigma: F64, walked: F64, margins: tuple[float, float]) -> Likely:
+    """Margins of b_a and b_w on the specified ``sigma`` (6,) of the start.
 
     ``biases`` (6,) [m/s^2, rad/s] with ``cov`` (6, 6) are the estimate that was made with ``margins``, and ``walked``
     (6,) the variance that they may have gathered since the start.
@@ -43,17 +51,34 @@ def likely_margins(
     information = np.asarray(np.linalg.inv(cov), np.float64)
     used = (np.repeat(margins, 3) * sigma) ** 2 + walked
     tried = (_EACH * sigma) ** 2 + walked
+    right = information @ biases
     log_likelihood = np.empty(len(tried))
-    _log_likelihoods(information, information @ biases, 1.0 / tried, 1.0 / used, log_likelihood)
+    _log_likelihoods(information, right, 1.0 / tried, 1.0 / used, log_likelihood)
     log_weight = log_likelihood + _LOG_PRIOR
     if not math.isfinite(log_weight.max()):  # a covariance that is none by rounding says nothing
-        return margins
+        return Likely(margins, information, np.zeros((6, 6)))
     weight = np.exp(log_weight - log_weight.max())
-    log_margins = weight @ np.log(_PAIRS) / weight.sum()
-    if np.abs(log_margins - np.log(margins)).max() < np.log(CHANGED):
-        return margins
-    accel, gyro = np.exp(log_margins)
-    return float(accel), float(gyro)
+    weight /= weight.sum()
+    log_margins = weight @ np.log(_PAIRS)
+    in_use = information
+    if np.abs(log_margins - np.log(margins)).max() >= np.log(CHANGED):
+        accel, gyro = np.exp(log_margins)
+        margins = float(accel), float(gyro)
+        in_use = information + np.diag(1.0 / ((np.repeat(margins, 3) * sigma) ** 2 + walked) - 1.0 / used)
+    with_each = information + (1.0 / tried - 1.0 / used)[:, :, None] * np.eye(6)
+    return Likely(margins, in_use, _lacking(weight, with_each, right, in_use))
+
+
+def _lacking(weight: F64, with_each: F64, right: F64, in_use: F64) -> F64:
+    """Second moments of the estimates with informations (n, 6, 6) about that ``in_use``, less its own covariance.
+
+    All have the same ``right`` side (6,); where they are less, nothing is lacking.
+    """
+    cov_each, cov = np.linalg.inv(with_each), np.linalg.inv(in_use)
+    off = (cov_each - cov) @ right
+    lacking = np.einsum("m,mij->ij", weight, cov_each) + (off.T * weight) @ off - cov
+    values, vectors = np.linalg.eigh(0.5 * (lacking + lacking.T))
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
 
 @njit(cache=True, nogil=True)

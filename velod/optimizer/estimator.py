@@ -100,6 +100,8 @@ class Estimator:
         self.own_solution: tuple[int, F64, F64] | None = None  # end of the newest batch with one, s_L there, its e
         self._open: list[Interval] = []  # that may get flows yet; the last one is incomplete
         self._started_ns = 0
+        self._bias_doubt = np.zeros((6, 6))  # for their margins, when this was known of them:
+        self._bias_information = np.zeros((6, 6))
         self._depth_m = USUAL_DEPTH  # median of the newest batch
         self._still_to = NEVER  # up to here rest has been observed
         self._weak_L: F64 = np.empty((0, 3))  # directions that the newest batch with flow does not constrain
@@ -179,11 +181,25 @@ class Estimator:
         sigma = np.repeat([imu.accel_bias_sigma, imu.gyro_bias_sigma], 3)
         walked = np.repeat([imu.accel_bias_walk, imu.gyro_bias_walk], 3) ** 2 * seconds
         biases = np.concatenate([head.b_a, head.b_w])
-        margins = likely_margins(biases, head.cov[3:9, 3:9], sigma, walked, self._bias_margins)
-        if margins != self._bias_margins:
-            self._bias_margins = margins
-            self.window.widen_bias_prior(margins)
+        likely = likely_margins(biases, head.cov[3:9, 3:9], sigma, walked, self._bias_margins)
+        self._bias_doubt, self._bias_information = likely.doubt, likely.information
+        if likely.margins != self._bias_margins:
+            self._bias_margins = likely.margins
+            self.window.widen_bias_prior(likely.margins)
             self._count("bias.prior_changed")
+
+    def _doubt_of_margins(self, t_ns: int) -> F64:
+        """Covariance (3, 3) of v_B at ``t_ns`` for other margins of the biases than those in use.
+
+        What is learnt after the prior has left the window lets the states follow a bias less and less.
+        """
+        head = self.head
+        if head is None or not self._bias_doubt.any():
+            return np.zeros((3, 3))
+        p, v_B, _ = self._carry(head, t_ns)
+        J = inertial_residual.carried_jacobian(p, v_B, head.R_LB) @ head.cov[:, 3:9] @ self._bias_information
+        doubt_B: F64 = J @ self._bias_doubt @ J.T
+        return doubt_B
 
     def _hear_witness(self) -> None:
         """Compare the newest estimate with the one that the IMU alone has carried on since flow and IMU disagree."""
@@ -231,6 +247,7 @@ class Estimator:
         if predicted is None:
             return None
         v, cov = predicted[0], predicted[1] * self.consistency.factor + self._doubt(t_ns)
+        cov = cov + self._doubt_of_margins(t_ns)
         if not self._standstill.goes_on(self.memory, t_ns, self._biases()[1]):
             return v, cov
         sigma = max(self._still_sigma(), RESTING_SIGMA)
