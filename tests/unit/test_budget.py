@@ -108,6 +108,20 @@ def test_an_ingest_that_is_late_makes_fewer_batches_then_looks_at_fewer_rows() -
     assert load.budget() == Budget(room=MAX_WAITING)
 
 
+def test_a_stream_that_is_far_too_much_loses_rows_and_then_no_more_packets() -> None:
+    """Twice as much as can be looked at, in packets of 5 ms."""
+    load = LoadShedder(TARGET_S)
+    waited_s, dropped = 0.0, []
+    for i in range(400):
+        taken = load.takes_packet(waited_s, 0.005 * i)
+        dropped.append(not taken)
+        cost_s = 0.01 * load.budget().rows if taken else 0.0
+        waited_s = max(0.0, waited_s + cost_s - 0.005)
+    assert any(dropped[:200])
+    assert np.mean(dropped[200:]) < 0.1
+    assert load.budget().rows < 0.7
+
+
 def test_event_by_event_packets_and_slices_may_wait_for_their_own_target() -> None:
     load = LoadShedder(TARGET_S, 0.2 * TARGET_S)
     assert load.takes_packet(0.2 * NO_PACKET * TARGET_S - 1e-3, 0.0)

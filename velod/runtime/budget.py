@@ -40,10 +40,11 @@ LONGER_FOR_S = 10.0
 LEAST_BATCHES = 0.1
 NO_BATCH = 2.0
 """While a batch is later than this many targets, no further one is made."""
-FEWER_ROWS = 2.0
+FEWER_ROWS = 1.5
 """While a packet waits for more than this many targets, fewer rows are looked at: fewer batches were not enough."""
 NO_PACKET, PACKETS_AGAIN = 3.0, 2.0
-"""Once an event packet has waited for this many targets, all are dropped until one has waited for so few."""
+"""Once an event packet has waited for this many targets, all are dropped until one has waited for so few. That is
+still late for rows, or a stream that is far too much would only ever lose packets, which are holes in time."""
 MAX_WAITING = 8
 """Batches that may wait for a worker at once; each holds the surfaces of both cameras."""
 ALARM_BELOW = 0.95
