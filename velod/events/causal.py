@@ -11,11 +11,11 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from velod.events.plane_fit import HALF, INNER_AT, REACH, RING_AT, SIZE, WIDE_SIZE, fit_plane, rms_px
+from velod.events.plane_fit import HALF, REACH, SIZE, WIDE_SIZE, fit_plane, rms_px
 from velod.events.sae import NEVER, enter_last
 from velod.events.selection import GOOD, MAX_ASYMMETRY, SYMMETRY_NOISE
 from velod.events.surface_clock import EMPTY
-from velod.types import I32, I64, PATCH, RING, U8, U16, U32, WIDE
+from velod.types import F64, I32, I64, PATCH, RING, U8, U16, U32, WIDE
 
 
 @njit(cache=True, nogil=True)
@@ -56,66 +56,84 @@ def enter_and_select(
     does not fit is not selected.
     """
     _, h, w = first.shape
-    low = max(border_px, REACH)
+    low, slack_ns = max(border_px, REACH), SYMMETRY_NOISE * time_noise_s * 1e9
+    flat, flat_taken = first.reshape(-1), taken.reshape(-1)
     age = np.empty(SIZE, np.float64)
     places, stamp, begins = np.empty((3, t_ns.size), np.int32)
     for i in begins[: enter_last(x, y, t_ns, p, last, refractory_ns, epoch_ns, places, stamp, begins)]:
-        k, r, c, t = int(p[i]), int(y[i]), int(x[i]), int(stamp[i])
-        first[k, r, c] = t
+        place, r, c, t = int(places[i]), int(y[i]), int(x[i]), int(stamp[i])
+        # Unsigned, here and below, so that nobody looks whether it counts from the end.
+        flat[np.uint32(place)] = t
         for dr in range(-REACH, REACH + 1, REACH):
             rm = r - dr
             if rm < low or rm >= h - low:
                 continue
-            opens = open_ns[row_cell[rm]]
+            opens = open_ns[np.uint32(row_cell[np.uint32(rm)])]
             for dc in range(-REACH, REACH + 1, REACH):
                 cm = c - dc
                 if cm < low or cm >= w - low or n == len(at) or (dr == 0 and dc == 0):
                     continue
-                if t_ns[i] < opens[column_cell[cm]]:
+                cell = np.uint32(column_cell[np.uint32(cm)])
+                if t_ns[i] < opens[cell]:
                     continue
-                middle = first[k, rm, cm]
+                mid = place - dr * w - dc
+                middle = flat[np.uint32(mid)]
                 # On a plane whose newest outer neighbour is the arriving event the one opposite to it is the oldest.
                 # One branch for all, as each of them would often be mistaken.
-                due = (t - middle <= memory_ns // 2) & (first[k, rm - dr, cm - dc] <= middle)
-                if not (due & (middle != taken[k, rm, cm])):
+                due = (t - middle <= memory_ns // 2) & (flat[np.uint32(mid - dr * w - dc)] <= middle)
+                if not (due & (middle != flat_taken[np.uint32(mid)])):
                     continue
-                if not _symmetric(first[k], rm, cm, t, memory_ns, SYMMETRY_NOISE * time_noise_s * 1e9):
+                if not _symmetric(flat, mid, w, t, memory_ns, slack_ns):
                     continue
-                for q in range(SIZE):
-                    # The age of the arriving event is 1 ns: 0 is a missing one.
-                    a = t + 1 - first[k, rm - HALF + q // PATCH, cm - HALF + q % PATCH]
-                    age[q] = a * 1e-9 if a <= memory_ns else 0.0
+                _ages(flat, mid, w, t, memory_ns, age)
                 left, gx, gy, _, rms, _, _, _ = fit_plane(age, reject_px, rejections, min_neighbours, time_noise_s)
                 # A cell that has waited for another rest takes what is merely acceptable.
-                waited = t_ns[i] >= opens[column_cell[cm]] + rest_ns
+                waited = t_ns[i] >= opens[cell] + rest_ns
                 residual_px = rms_px(rms, gx * gx + gy * gy, time_noise_s)
                 if left == 0 or not residual_px < (1.0 if waited else GOOD) * max_rms_px:
                     continue
-                at[n, 0], at[n, 1], at[n, 2] = k, rm, cm
-                for q in range(WIDE_SIZE):
-                    s = first[k, rm - REACH + q // WIDE, cm - REACH + q % WIDE]
-                    times_ns[n, q] = s + epoch_ns if s != EMPTY else NEVER
+                at[n, 0], at[n, 1], at[n, 2] = p[i], rm, cm
+                _copy_times(flat, mid, w, epoch_ns, times_ns[n])
                 n += 1
-                taken[k, rm, cm] = middle
-                opens[column_cell[cm]] = t_ns[i] + rest_ns
+                flat_taken[np.uint32(mid)] = middle
+                opens[cell] = t_ns[i] + rest_ns
     return n
 
 
-@njit(cache=True, nogil=True)
-def _symmetric(surface: I32, r: int, c: int, t: int, memory_ns: int, slack_ns: float) -> bool:
-    """Whether opposite outer neighbours lie symmetrically about (r, c) in time, as on a plane; none: oldest.
+@njit(cache=True, nogil=True, inline="always")
+def _symmetric(flat: I32, mid: int, w: int, t: int, memory_ns: int, slack_ns: float) -> bool:
+    """Whether opposite outer neighbours lie symmetrically about ``mid`` in time, as on a plane; none: oldest.
 
     ``slack_ns`` of asymmetry is allowed in any case.
     """
-    middle = min(t - surface[r, c], memory_ns)
+    middle = min(t - flat[np.uint32(mid)], memory_ns)
     symmetric = antisymmetric = 0
-    for j in range(4):
-        dr, dc = REACH * (j // 3 - 1), REACH * (j % 3 - 1)
-        a = min(t - surface[r + dr, c + dc], memory_ns) - middle
-        b = min(t - surface[r - dr, c - dc], memory_ns) - middle
+    for step in (REACH * (w + 1), REACH * w, REACH * (w - 1), REACH):
+        a = min(t - flat[np.uint32(mid - step)], memory_ns) - middle
+        b = min(t - flat[np.uint32(mid + step)], memory_ns) - middle
         symmetric += abs(a + b)
         antisymmetric += abs(a - b)
     return symmetric <= MAX_ASYMMETRY * antisymmetric + slack_ns
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _ages(flat: I32, mid: int, w: int, t: int, memory_ns: int, age: F64) -> None:
+    """Ages in s of the 5x5 about ``mid``, 0 where older than the memory; that of an event at ``t`` is 1 ns."""
+    for r in range(PATCH):
+        row = mid + (r - HALF) * w - HALF
+        for c in range(PATCH):
+            a = t + 1 - flat[np.uint32(row + c)]
+            age[PATCH * r + c] = a * 1e-9 if a <= memory_ns else 0.0
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _copy_times(flat: I32, mid: int, w: int, epoch_ns: int, times_ns: I64) -> None:
+    """Times of the 7x7 about ``mid``, NEVER where there is none."""
+    for r in range(WIDE):
+        row = mid + (r - REACH) * w - REACH
+        for c in range(WIDE):
+            stamp = flat[np.uint32(row + c)]
+            times_ns[WIDE * r + c] = stamp + epoch_ns if stamp != EMPTY else NEVER
 
 
 def all_open(rows: int, columns: int) -> I64:
@@ -134,8 +152,11 @@ def split_ages(times_ns: I64, t_end_ns: int, memory_ns: int, age: U32, patch: U3
         for j in range(WIDE_SIZE):
             a = t_end_ns - times_ns[i, j]
             wide[j] = np.uint32(a if a <= memory_ns else 0)
-        for j in range(SIZE):
-            patch[i, j] = wide[INNER_AT[j]]
-        for j in range(RING):
-            ring[i, j] = wide[RING_AT[j]]
+        for r in range(PATCH):
+            for c in range(PATCH):
+                patch[i, PATCH * r + c] = wide[WIDE * (r + 1) + 1 + c]
+        for j in range(WIDE):
+            ring[i, j], ring[i, RING - WIDE + j] = wide[j], wide[WIDE_SIZE - WIDE + j]
+        for r in range(PATCH):
+            ring[i, WIDE + 2 * r], ring[i, WIDE + 2 * r + 1] = wide[WIDE * (r + 1)], wide[WIDE * (r + 2) - 1]
         age[i] = wide[WIDE_SIZE // 2]

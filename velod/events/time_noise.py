@@ -18,6 +18,8 @@ GROUPS = 4
 """Planes are sorted by slope into so many groups, each of which counts with its medians."""
 MIN_PLANES = 40
 """A batch with fewer tells nothing."""
+MOST_PLANES = 2048
+"""Of more there is no need; the paper's quota is far below."""
 GAIN = 0.5
 """Share of a new batch in the estimate."""
 MEDIAN_OF_VARIANCE = 1.0 / 0.97

@@ -106,9 +106,11 @@ class Slices:
         age = np.minimum(t_end_ns - self._times_ns[: self._n, MIDDLE], MAX_AGE_NS)
         return x.astype(np.uint16), y.astype(np.uint16), age.astype(np.uint32), p.astype(np.uint8)
 
-    def patches(self, t_end_ns: int) -> U32:
-        """(n, 25) ages in ns of the 5x5 neighbours of all events that were selected since ``begin_batch``."""
-        return self._ages(slice(self._n), t_end_ns)[1]
+    def patches(self, t_end_ns: int, most: int) -> U32:
+        """(n, 25) ages in ns of the 5x5 neighbours of the events that were selected since ``begin_batch``, or of so
+        many of them, evenly spread.
+        """
+        return self._ages(slice(0, self._n, max(1, -(-self._n // most))), t_end_ns)[1]
 
     def _enter(self, batch: OpenBatch, t_ns: int, rest_ns: int) -> None:
         s, fit, left = self._settings.ingest, self._settings.flow, self._left
@@ -146,7 +148,7 @@ class Slices:
 
     def _ages(self, which: slice, t_end_ns: int) -> tuple[U32, U32, U32]:
         """age (n,), patch (n, 25) and ring (n, 24) of these of the selected, ns before ``t_end_ns``."""
-        times_ns = self._times_ns[which]
+        times_ns = np.ascontiguousarray(self._times_ns[which])
         n = len(times_ns)
         age, patch, ring = np.empty(n, np.uint32), np.empty((n, SIZE), np.uint32), np.empty((n, RING), np.uint32)
         split_ages(times_ns, t_end_ns, self._memory_ns, age, patch, ring)

@@ -17,7 +17,7 @@ from velod.events.plane_fit import SIZE
 from velod.events.sae import NEVER, age_unit_ns, encode_ages, encode_newest, gather_patches
 from velod.events.selection import select_burst, select_paper
 from velod.events.sensor_size import for_sensor
-from velod.events.time_noise import TimeNoise
+from velod.events.time_noise import MOST_PLANES, TimeNoise
 from velod.geometry.calibration import Calibration
 from velod.ingest.batch import OpenBatch
 from velod.ingest.budget import Budget
@@ -222,7 +222,7 @@ class IngestStage:
                 )
             ]
         else:
-            patch = self._slices.patches(t_end_ns)
+            patch = self._slices.patches(t_end_ns, MOST_PLANES)
             x, y, age, p = self._slices.selected(t_end_ns)
             event_batches = self._slices.rest_of(self._open, seq, t_end_ns)
             t_start_ns = self._slices.begin_batch()
