@@ -68,7 +68,7 @@ def test_deaths_before_it_was_warm_and_single_ones_say_nothing() -> None:
 
 def soak_of(growth_mib: float) -> Soak:
     faults = {"kill flow-0": 2, "kill depth-0": 3, "kill ingest-0": 1}
-    return Soak(180.0, faults, 9000, 0.4, 20.0, "kill ingest-0", "", 10.0, 10.0, 150.0, growth_mib, [])
+    return Soak(180.0, faults, 9000, 0.4, 20.0, "kill ingest-0", "", 10.0, 10.0, 150.0, growth_mib, 1.0, [])
 
 
 def test_one_pool_that_nobody_owns_any_more_is_a_leak_of_the_host_s() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -147,7 +148,8 @@ def _soak(args: argparse.Namespace) -> int:
         f"{result.seconds:.0f} s; faults: {hits or 'none'}; {result.served} valid velocities;"
         f" the longest time without one: {result.gap()}; latency {result.latency_middle_ms:.1f} ms in the middle,"
         f" {result.latency_last_ms:.1f} ms in the end; shared memory of all {result.shared_mib:.0f} MiB"
-        f" ({result.shared_growth_mib:+.1f} MiB since the beginning)",
+        f" ({result.shared_growth_mib:+.1f} MiB since the beginning); load of the machine up to"
+        f" {result.highest_load:.1f} on {os.cpu_count()} cores",
         file=out,
     )
     for p in result.processes:

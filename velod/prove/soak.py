@@ -63,6 +63,7 @@ class Soak:
     latency_last_ms: float
     shared_mib: float  # the host's, of all processes, each piece once
     shared_growth_mib: float  # since the first faults
+    highest_load: float  # of the machine, over a minute: above its cores, others took what velod needed
     processes: list[Lasting]
 
     def failures(self) -> list[str]:
@@ -103,6 +104,7 @@ def soak(recording: Path, seconds: float, fault_every_s: float, seed: int, on_fa
     series: dict[str, Series] = {}
     latency_ms: list[tuple[float, float]] = []
     shared_mib: list[float] = []
+    load: list[float] = []
     hits: list[Hit] = []
     with Besieged(recording, speed=1.0) as target:
         start_s = time.monotonic()
@@ -112,6 +114,7 @@ def soak(recording: Path, seconds: float, fault_every_s: float, seed: int, on_fa
             time.sleep(SAMPLE_S)
             _sample(target, series, time.monotonic() - start_s)
             shared_mib.append(shared_memory_mib(target.process_ids().values()))
+            load.append(os.getloadavg()[0])
             health = target.health_of("optimizer-0")
             if health.seq != seen and "end_to_end_p50" in health.latency_ms:
                 seen = health.seq
@@ -135,6 +138,7 @@ def soak(recording: Path, seconds: float, fault_every_s: float, seed: int, on_fa
             _median(latency_ms, 2 * seconds / 3, seconds),
             shared_mib[-1],
             shared_mib[-1] - shared_mib[0],
+            max(load),
             [judge(w, s, seconds, hits) for w, s in sorted(series.items()) if s.lasted(seconds)],
         )
 
