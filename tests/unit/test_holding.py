@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import sys
 from dataclasses import replace
 from multiprocessing.shared_memory import SharedMemory
@@ -35,7 +34,7 @@ def held(more_after: dict[float, float], base_mib: float = 140.0) -> Series:
     return Series(1, t_s, list(used_mib), used_mib, [40] * len(t_s))
 
 
-def of(series: Series, hits: list[Hit] = HITS) -> float:
+def of(series: Series, hits: list[Hit] = HITS) -> float | None:
     return judge("optimizer-0", series, SECONDS, hits).death_mib
 
 
@@ -63,7 +62,7 @@ def test_what_was_freed_and_is_kept_for_what_comes_next_is_none() -> None:
 
 def test_deaths_before_it_was_warm_and_single_ones_say_nothing() -> None:
     early: list[Hit] = [(WARM_UP_S - 5.0, "kill flow-0"), (WARM_UP_S - 2.0, "kill flow-0"), (60.0, "kill flow-0")]
-    assert math.isnan(of(held({2.0: 50.0, 6.0: 50.0}), early))
+    assert of(held({2.0: 50.0, 6.0: 50.0}), early) is None
 
 
 def soak_of(growth_mib: float) -> Soak:

@@ -153,10 +153,11 @@ def _soak(args: argparse.Namespace) -> int:
         file=out,
     )
     for p in result.processes:
+        kept = "nothing can be said" if p.death_mib is None else f"{p.death_mib:+.2f} MiB, {p.death_files:+.1f} files"
         print(
             f"{p.worker:<14} {p.seconds:6.0f} s  {p.mib:6.1f} MiB, {p.files} files; in the last third"
             f" {p.growth_mib:+.2f} MiB ({p.slope_mib_h:+.2f} MiB/h), {p.new_files:+d} files;"
-            f" kept of each death {p.death_mib:+.2f} MiB, {p.death_files:+.1f} files",
+            f" kept of each death {kept}",
             file=out,
         )
     return _end(args, asdict(result), result.failures())

@@ -54,8 +54,8 @@ class Lasting:
     slope_mib_h: float  # of a line through the last third
     growth_mib: float  # in the last third: of what is resident, by that line, or of what is used, whichever is less
     new_files: int  # in the last third
-    death_mib: float  # kept of each worker that died (``kept_of_deaths``); NaN: too few did
-    death_files: float
+    death_mib: float | None  # kept of each worker that died (``kept_of_deaths``); None: too few did
+    death_files: float | None
 
 
 def judge(worker: str, series: Series, seconds: float, hits: Sequence[Hit]) -> Lasting:
@@ -79,8 +79,8 @@ def judge(worker: str, series: Series, seconds: float, hits: Sequence[Hit]) -> L
     )
 
 
-def kept_of_deaths(t_s: Sequence[float], held: Sequence[float], hits: Iterable[Hit], end_s: float) -> float:
-    """How much more is held for each death of another worker; NaN where no kind of worker died twice.
+def kept_of_deaths(t_s: Sequence[float], held: Sequence[float], hits: Iterable[Hit], end_s: float) -> float | None:
+    """How much more is held for each death of another worker; None where no kind of worker died twice.
 
     A death's share is what was held just before the next fault, less what was just before the death: what faults of
     other kinds do is not its. Of each kind of worker it is the (lower) median, as a leak shows at every death, and of
@@ -90,7 +90,7 @@ def kept_of_deaths(t_s: Sequence[float], held: Sequence[float], hits: Iterable[H
     for (hit_s, fault), (next_s, _) in pairwise([*hits, (end_s, "")]):
         if fault.startswith(KILL):
             kept.setdefault(fault, []).append(_before(next_s, t_s, held) - _before(hit_s, t_s, held))
-    return max((sorted(k)[(len(k) - 1) // 2] for k in kept.values() if len(k) > 1), default=math.nan)
+    return max((sorted(k)[(len(k) - 1) // 2] for k in kept.values() if len(k) > 1), default=None)
 
 
 def _rise(held: Sequence[float]) -> float:

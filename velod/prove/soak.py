@@ -76,8 +76,9 @@ class Soak:
                 found.append(f"{p.worker} grew by {p.growth_mib:.1f} MiB in the last third")
             if p.new_files > 0:
                 found.append(f"{p.worker} has {p.new_files} more files open")
-            if p.death_mib > MAX_DEATH_MIB or p.death_files > MAX_DEATH_FILES:
-                found.append(f"{p.worker} keeps {p.death_mib:.1f} MiB, {p.death_files:.1f} files of each dead worker")
+            mib, files = p.death_mib or 0.0, p.death_files or 0.0
+            if mib > MAX_DEATH_MIB or files > MAX_DEATH_FILES:
+                found.append(f"{p.worker} keeps {mib:.1f} MiB, {files:.1f} files of each dead worker")
         deaths = sum(n for fault, n in self.faults.items() if fault.startswith(KILL))
         if self.shared_growth_mib > MAX_SHARED_MIB + deaths * MAX_DEATH_SHARED_MIB:
             found.append(f"shared memory grew by {self.shared_growth_mib:.0f} MiB over {deaths} deaths")
