@@ -17,8 +17,9 @@ from velod.cli.through_processes import free_port, through_the_processes
 from velod.config import Settings, from_tree
 from velod.eval import bench_input
 from velod.eval.bench import Result, Size, measure
-from velod.eval.bench_cases import GROUPS, Packets, cases
+from velod.eval.bench_cases import GROUPS, cases
 from velod.eval.bench_input import RIG
+from velod.eval.bench_pipeline import Packets
 from velod.eval.latency import LEGS, Trace
 from velod.runtime.hop import measure as measure_hop
 from velod.runtime.offline import run_offline

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -192,3 +193,23 @@ def _batches(
         np.ones(m, np.uint8),
     )
     return flow, depth
+
+
+def batch_packets(seconds: float, n: int) -> Iterator[tuple[EventPacket, EventPacket]]:
+    """Left packets of ``n`` events and the right events up to the same time; the stream is repeated for ever."""
+    left, right = (events(seconds, d, seed=2) for d in (0.0, DISPARITY_PX))
+    ends = np.arange(n, len(left.t_ns), n)
+    edges_ns = left.t_ns[ends]
+    seqs = count()
+    for lap in count():
+        shift_ns = lap * int(seconds * NS_PER_S)
+        start_ns = 0
+        for seq, edge_ns in zip(seqs, [0, *edges_ns.tolist()], strict=False):
+            pair = []
+            for camera, e in (("left", left), ("right", right)):
+                part = slice(*np.searchsorted(e.t_ns, [start_ns, edge_ns]).tolist())
+                t_ns = e.t_ns[part] + shift_ns
+                pair.append(EventPacket(seq, edge_ns + shift_ns, camera, e.x[part], e.y[part], t_ns, e.p[part]))
+            start_ns = edge_ns
+            if edge_ns:
+                yield pair[0], pair[1]
