@@ -218,14 +218,14 @@ class OptimizerSettings:
     )
     fixed_sigma_px_s: float = _f(20.0, "sigma of a flow residual with weights = 'fixed', px/s", above=0.0, hi=1e4)
     shared_error: float = _f(
-        5.0, "information of a batch is divided by this for errors its flows share", lo=1.0, hi=100.0
+        6.0, "information of a batch is divided by this for errors its flows share", lo=1.0, hi=100.0
     )
     shared_gyro_noise: bool = _f(
         True,
         "the gyroscope's noise of a moment is in its flows as well, or false: in the IMU's factor alone (the paper)",
     )
     flow_scale_sigma: float = _f(
-        0.004, "1 sigma of an error of all flows' speeds, as a share, which lasts seconds", above=0.0, hi=0.1
+        0.002, "1 sigma of an error of all flows' speeds, as a share, which lasts seconds", above=0.0, hi=0.1
     )
     depth_scale_sigma: float = _f(
         0.003, "1 sigma of an error of all inverse depths, as a share, which lasts seconds", above=0.0, hi=0.1
