@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from velod.eval.judged_events import AROUND, beside_jump
 from velod.eval.scene_truth import DepthImages, SceneTruthError, rays
 from velod.geometry.calibration import Calibration
 from velod.geometry.rectify import rectify
@@ -135,3 +136,17 @@ def test_a_motion_alone_does_not_make_a_simulated_recording(simulated: Callable[
     assert recipe_of(calibration, truth, depth) is None
     assert recipe_of(calibration, truth, None) is None
     assert recipe_of(calibration, true_motion(sequence("boxes-5").trajectory, 0.6), depth) is None
+
+
+@pytest.mark.parametrize(
+    ("depths", "jump"),
+    [
+        (1.0 / (0.3 + 0.05 * AROUND[:, 0] + 0.03 * AROUND[:, 1]), False),  # a plane that leans by 53 % over 5 px
+        (np.where(AROUND[:, 0] > 0, 3.0 * 1.07, 3.0), True),
+        (np.where(AROUND[:, 0] >= 0, 3.0 * 1.03, 3.0), False),
+        (np.where(AROUND[:, 1] == 0, 3.0, 2.7), True),  # a pole
+        (np.where(AROUND.sum(axis=1) == 2, np.nan, 3.0), True),
+    ],
+)
+def test_a_jump_of_depth_is_what_no_plane_is_however_it_leans(depths: np.ndarray, jump: bool) -> None:
+    assert beside_jump(depths[None]).tolist() == [jump]

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from velod.config import DepthSettings
-from velod.eval.scene_truth import JUMP, TrueDepth, motion_of_camera, rays
+from velod.eval.scene_truth import TrueDepth, motion_of_camera, rays
 from velod.geometry.calibration import Calibration
 from velod.geometry.camera import motion_field_rows
 from velod.geometry.rectify import Rectification, rectify
@@ -26,7 +26,13 @@ Bools = NDArray[np.bool_]
 MIN_FLOW_PX_S = 20.0
 """A slower true normal flow has no ratio worth the name."""
 
+AROUND = np.array([(0, 0), *((a, b) for a in (-1, 0, 1) for b in (-1, 0, 1) if (a, b) != (0, 0))])
+"""(9, 2): where depth is looked up, at an event and around it, in steps of _AROUND_PX."""
 _AROUND_PX = 2.5
+_OPPOSITE = (1, 8), (2, 7), (3, 6), (4, 5)
+_STEP = 0.05
+"""Inverse depths around an event that are off a plane's by this share are not those of one surface: on a plane, however
+it leans, inverse depth is linear. A step of 5 % is 0.4 px where the disparity is 7 px, ten times its sigma."""
 _HIDDEN = 0.02  # the right camera sees something nearer by this share
 
 
@@ -82,7 +88,7 @@ def judged_events(
     flow = _spread_out(len(t_ns), begin, flows, ("n", "speed", "sigma"))
     depth = _spread_out(len(t_ns), whole, depths, ("disparity", "inv_depth", "sigma", "refined"))
     seen = _look(true_depth, rect, t_ns, x, y)
-    z, jump, f_b = seen[:, 0], _beside_jump(seen), rect.f * rect.baseline_m
+    z, jump, f_b = seen[:, 0], beside_jump(seen), rect.f * rect.baseline_m
     speed, inv_depth = flow["speed"][:, 0], depth["inv_depth"][:, 0]
     true_speed = _best(_true_flow(truth, rect, t_ns, x, y, flow["n"], seen), speed, jump)
     slow = ~(np.abs(true_speed) > MIN_FLOW_PX_S)
@@ -109,10 +115,11 @@ def judged_events(
     )
 
 
-def _beside_jump(seen: F64) -> Bools:
-    """(n,) where the depths (n, 9) at and around an event differ by more than JUMP, or are not all known."""
-    near, far = (f(seen, axis=1) for f in (np.fmin.reduce, np.fmax.reduce))
-    return np.asarray(~np.isfinite(seen).all(axis=1) | (far - near > JUMP * 0.5 * (far + near)))
+def beside_jump(seen: F64) -> Bools:
+    """(n,) where the inverses of the depths (n, 9) at and around an event are off a plane's by _STEP, or unknown."""
+    inverse = 1.0 / seen
+    bends = [inverse[:, i] + inverse[:, j] - 2.0 * inverse[:, 0] for i, j in _OPPOSITE]
+    return np.asarray(~(np.max(np.abs(bends), axis=0) <= _STEP * inverse[:, 0]))
 
 
 def _true_flow(truth: Truth, rect: Rectification, t_ns: I64, x: F64, y: F64, n: F64, z: F64) -> F64:
@@ -140,7 +147,7 @@ def _spread_out(
 
 def _look(true_depth: TrueDepth, rect: Rectification, t_ns: I64, x: F64, y: F64) -> F64:
     """(n, 9): depth at each event, and _AROUND_PX from it in eight directions."""
-    step = _AROUND_PX * np.array([(0, 0), *((a, b) for a in (-1, 0, 1) for b in (-1, 0, 1) if (a, b) != (0, 0))])
+    step = _AROUND_PX * AROUND
     return true_depth(t_ns, rays(rect, x[:, None] + step[:, 0], y[:, None] + step[:, 1]))
 
 
