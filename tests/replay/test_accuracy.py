@@ -96,6 +96,14 @@ def test_the_judge_of_the_stages_sees_a_wrong_baseline_and_a_shifted_disparity(r
     assert replace(run, flows=faster).stage_errors().flow.bias == pytest.approx(0.1, abs=0.012)
 
 
+def test_stamps_that_are_late_are_found_from_the_change_of_the_flow(run: Run) -> None:
+    """Under three of its own errors without; of two milliseconds all, but for what the edge does meanwhile."""
+    flow = run.stage_errors().flow
+    assert abs(flow.late_s) < 3.0 * flow.late_se_s + 3e-4
+    late = [replace(batch, t_ns=batch.t_ns + 2_000_000) for batch in run.selected]
+    assert replace(run, selected=late).stage_errors().flow.late_s - flow.late_s == pytest.approx(2e-3, rel=0.15)
+
+
 def test_groups_hold_every_event_once(run: Run) -> None:
     errors = run.stage_errors()
     for what in ("distance", "polarity"):

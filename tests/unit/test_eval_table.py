@@ -177,7 +177,7 @@ def test_judging_agrees_with_the_metrics_of_velod_eval() -> None:
 
 
 def stages(**changes: object) -> StageErrors:
-    flow = FlowErrors(1000, -0.002, 0.0004, 0.03, 0.001, 0.9, 1.1, 0.02)
+    flow = FlowErrors(1000, -0.002, 0.0004, 0.03, 0.001, 0.9, 1.1, 0.02, 0.0011, 0.0001)
     depth = DepthErrors(800, 0.0031, 0.001, 0.04, 0.02, -0.001, 0.012, math.nan, 0.95, 0.005)
     groups = {"polarity": [Group("ON", flow, depth), Group("OFF", replace(flow, n=0, bias=math.nan), depth)]}
     known = StageErrors("casting", 2000, 0.9, 0.1, 0.99, 0.8, 0.88, 0.75, flow, depth, depth, depth, groups)
@@ -187,7 +187,7 @@ def stages(**changes: object) -> StageErrors:
 def test_stage_errors_are_shown_in_percent_and_pixels_and_a_dash_where_there_is_no_truth() -> None:
     shares, flow, depth = overview_tables({"a": stages(), "b": None}).values()
     assert shares[1] == ["a", "2000", "90.0", "10.0", "99.0", "80.0", "88.0", "75.0"]
-    assert flow[1] == ["a", "1000", "-0.20", "0.04", "3.00", "0.10", "0.90", "1.10", "2.00"]
+    assert flow[1] == ["a", "1000", "-0.20", "0.04", "3.00", "0.10", "0.90", "1.10", "2.00", "1.10", "0.10"]
     assert [line[1] for line in depth[1:4]] == ["all", "refined", "block"]
     assert depth[1][2:] == ["800", "0.003", "0.001", "0.040", "2.00", "-0.10", "1.20", "-", "0.95", "0.50"]
     assert all(set(table[-1][1:]) == {"-"} for table in (shares, flow, depth))

@@ -19,7 +19,7 @@ from velod.geometry.camera import motion_field_rows
 from velod.geometry.rectify import Rectification, rectify
 from velod.io.model import Truth
 from velod.optimizer.parts import batch_seq
-from velod.types import F64, I64, DepthBatch, EventBatch, FlowBatch
+from velod.types import F64, I64, NS_PER_S, DepthBatch, EventBatch, FlowBatch
 
 Bools = NDArray[np.bool_]
 
@@ -33,6 +33,7 @@ _OPPOSITE = (1, 8), (2, 7), (3, 6), (4, 5)
 _STEP = 0.05
 """Inverse depths around an event that are off a plane's by this share are not those of one surface: on a plane, however
 it leans, inverse depth is linear. A step of 5 % is 0.4 px where the disparity is 7 px, ten times its sigma."""
+_CHANGE_NS = 2_000_000
 _HIDDEN = 0.02  # the right camera sees something nearer by this share
 
 
@@ -51,6 +52,7 @@ class JudgedEvents:
     n_x: F64
     speed: F64  # measured, px/s
     true_speed: F64  # along the measured n; NaN where there is no flow
+    change: F64  # of true_speed in time at that place, px/s^2
     ratio: F64  # measured / true flow; NaN also where the true one is slow
     flow_sigmas: F64
     disparity_px: F64  # error
@@ -91,6 +93,9 @@ def judged_events(
     z, jump, f_b = seen[:, 0], beside_jump(seen), rect.f * rect.baseline_m
     speed, inv_depth = flow["speed"][:, 0], depth["inv_depth"][:, 0]
     true_speed = _best(_true_flow(truth, rect, t_ns, x, y, flow["n"], seen), speed, jump)
+    before, after = (
+        _true_flow(truth, rect, t_ns + step_ns, x, y, flow["n"], seen[:, :1])[:, 0] for step_ns in (-_CHANGE_NS, _CHANGE_NS)
+    )
     slow = ~(np.abs(true_speed) > MIN_FLOW_PX_S)
     true_inv_depth = _best(1.0 / seen, inv_depth, jump)
     right_z = true_depth(t_ns, rays(rect, x - f_b / z, y)[:, None], rect.baseline_m)[:, 0]
@@ -106,6 +111,7 @@ def judged_events(
         n_x=flow["n"][:, 0],
         speed=speed,
         true_speed=true_speed,
+        change=(after - before) * (0.5 * NS_PER_S / _CHANGE_NS),
         ratio=np.where(slow, np.nan, speed / true_speed),
         flow_sigmas=(speed - true_speed) / flow["sigma"][:, 0],
         disparity_px=depth["disparity"][:, 0] - f_b * true_inv_depth,

@@ -11,7 +11,7 @@ from velod.eval.stage_errors import DepthErrors, FlowErrors, StageErrors
 
 Table = list[list[str]]
 
-_FLOW = ("flows", "bias %", "± se", "spread %", "> 50 %: %", "sigmas", "std", "> 4: %")
+_FLOW = ("flows", "bias %", "± se", "spread %", "> 50 %: %", "sigmas", "std", "> 4: %", "late ms", "± se")
 _DEPTH = (
     *("depths", "bias px", "± se", "MAD px", "> 2 px: %", "Z bias %", "Z spread %"),
     *("sigmas", "std", "> 4: %"),
@@ -69,6 +69,7 @@ def _flow_cells(e: FlowErrors) -> list[str]:
         *(_percent(v, d) for v, d in ((e.bias, 2), (e.bias_se, 2), (e.spread, 2), (e.outliers, 2))),
         *(_number(v, 2) for v in (e.sigmas, e.std)),
         _percent(e.beyond_4, 2),
+        *(_number(1e3 * v, 2) for v in (e.late_s, e.late_se_s)),
     ]
 
 
