@@ -31,8 +31,8 @@ AROUND = np.array([(0, 0), *((a, b) for a in (-1, 0, 1) for b in (-1, 0, 1) if (
 _AROUND_PX = 2.5
 _OPPOSITE = (1, 8), (2, 7), (3, 6), (4, 5)
 _STEP = 0.05
-"""Inverse depths around an event that are off a plane's by this share are not those of one surface: on a plane, however
-it leans, inverse depth is linear. A step of 5 % is 0.4 px where the disparity is 7 px, ten times its sigma."""
+"""Inverse depths around an event that are off a plane's by this share are not those of one surface: on a plane,
+however it leans, inverse depth is linear. Where the disparity is 7 px, 5 % are 0.35 px, ten of its sigmas."""
 _CHANGE_NS = 2_000_000
 _HIDDEN = 0.02  # the right camera sees something nearer by this share
 
@@ -94,7 +94,8 @@ def judged_events(
     speed, inv_depth = flow["speed"][:, 0], depth["inv_depth"][:, 0]
     true_speed = _best(_true_flow(truth, rect, t_ns, x, y, flow["n"], seen), speed, jump)
     before, after = (
-        _true_flow(truth, rect, t_ns + step_ns, x, y, flow["n"], seen[:, :1])[:, 0] for step_ns in (-_CHANGE_NS, _CHANGE_NS)
+        _true_flow(truth, rect, t_ns + way_ns, x, y, flow["n"], seen[:, :1])[:, 0]
+        for way_ns in (-_CHANGE_NS, _CHANGE_NS)
     )
     slow = ~(np.abs(true_speed) > MIN_FLOW_PX_S)
     true_inv_depth = _best(1.0 / seen, inv_depth, jump)

@@ -196,7 +196,7 @@ def _standard_error(values: F64) -> float:
 
 
 def _late(error: F64, scaled: F64, change: F64) -> tuple[float, float]:
-    """Delay of the stamps, s, and its standard error: at a stamp the flow is that of a moment before, error = -delay x change.
+    """Delay of the stamps, s, and its standard error: the flow is that of a moment before, error = -delay x change.
 
     Least squares of the errors (n,), px/s, within 4 of their sigmas; NaN of few, and where nothing changes.
     """
