@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from tests.moving_edges import T0_NS, calibration, edges, event_batches, settings
+from velod.config import Settings, from_tree
 from velod.ingest.budget import BAND_ROWS, LEAST_ROWS, Budget
 from velod.ingest.stage import IngestStage
 from velod.runtime.budget import (
@@ -15,18 +14,18 @@ from velod.runtime.budget import (
     GRACE_S,
     HURRIED_S,
     LEAST_SELECTION,
-    LONGER_FOR_S,
-    LONGER_NS,
     MAX_WAITING,
     NO_PACKET,
+    SPACED_FOR_S,
     STANDING_S,
     STANDING_SELECTION,
     LoadShedder,
 )
-from velod.types import ImuSamples, StereoBatch
+from velod.ticks import tick_after, tick_ns
+from velod.types import NS_PER_S, ImuSamples, StereoBatch
 
 TARGET_S = 0.05
-LONGER = Budget(room=MAX_WAITING, shortest_ns=LONGER_NS)
+SPACED = Budget(room=MAX_WAITING, spaced=True)
 """Everything is taken on, in no more batches than outputs."""
 
 
@@ -40,21 +39,24 @@ def run(load: LoadShedder, delay_s: float, start_s: float, seconds: float) -> fl
 
 def test_without_delay_everything_is_taken_on() -> None:
     load = LoadShedder(TARGET_S)
-    now_s = run(load, 0.9 * HURRIED_S, 0.0, 1.0)
+    now_s = run(load, 0.4 * TARGET_S, 0.0, 1.0)
     assert load.takes_packet(0.4 * TARGET_S, now_s)
     assert load.budget() == Budget(room=MAX_WAITING)
 
 
-def test_a_batch_that_takes_too_long_makes_batches_longer_at_once_and_for_a_while() -> None:
+def test_a_batch_that_takes_too_long_makes_batches_as_few_as_outputs_at_once_and_for_a_while() -> None:
     load = LoadShedder(TARGET_S)
-    load.note_workers(1.1 * HURRIED_S, 0, 0.0)
-    assert load.budget() == LONGER
-    assert load.gauges()["batch.shortest_ms"] == 1e-6 * LONGER_NS
-    load.note_workers(0.0, 0, 0.99 * LONGER_FOR_S)
-    assert load.budget() == LONGER
-    load.note_workers(0.0, 0, 1.01 * LONGER_FOR_S)
+    load.note_workers(0.0, 0, 0.0)
+    load.note_unanswered(0.9 * HURRIED_S, 0.0)
     assert load.budget() == Budget(room=MAX_WAITING)
-    assert load.gauges()["batch.shortest_ms"] == 0.0
+    load.note_unanswered(1.1 * HURRIED_S, 0.0)
+    assert load.budget() == SPACED
+    assert load.gauges()["batches.spaced"] == 1.0
+    load.note_unanswered(0.0, 0.99 * SPACED_FOR_S)
+    assert load.budget() == SPACED
+    load.note_unanswered(0.0, 1.01 * SPACED_FOR_S)
+    assert load.budget() == Budget(room=MAX_WAITING)
+    assert load.gauges()["batches.spaced"] == 0.0
 
 
 def test_late_workers_get_fewer_events_then_no_batches_and_all_again_when_they_are_not() -> None:
@@ -70,19 +72,19 @@ def test_late_workers_get_fewer_events_then_no_batches_and_all_again_when_they_a
     now_s = run(load, 0.0, now_s, 1.0)
     assert 0.5 < load.budget().selection < 0.7
     run(load, 0.0, now_s, 1.0)
-    assert load.budget() == LONGER
+    assert load.budget() == Budget(room=MAX_WAITING)
 
 
 def test_a_queue_that_stands_is_drained_by_fewer_events_but_half_of_them_stay() -> None:
     load = LoadShedder(10.0 * STANDING_S)
     now_s = run(load, 1.2 * STANDING_S, 0.0, GRACE_S)
-    assert load.budget() == LONGER, "a moment's queue is none that stands"
+    assert load.budget() == Budget(room=MAX_WAITING), "a moment's queue is none that stands"
     now_s = run(load, 1.2 * STANDING_S, now_s, 0.5)
     assert STANDING_SELECTION < load.budget().selection < 0.9
     now_s = run(load, 9.0 * STANDING_S, now_s, 3.0)
-    assert load.budget() == replace(LONGER, selection=STANDING_SELECTION)
+    assert load.budget() == Budget(selection=STANDING_SELECTION, room=MAX_WAITING)
     run(load, 0.4 * STANDING_S, now_s, 1.1)
-    assert load.budget() == LONGER
+    assert load.budget() == Budget(room=MAX_WAITING)
 
 
 def test_a_queue_that_is_short_now_and_then_does_not_stand() -> None:
@@ -91,7 +93,7 @@ def test_a_queue_that_is_short_now_and_then_does_not_stand() -> None:
     for _ in range(10):
         now_s = run(load, 3.0 * STANDING_S, now_s, 0.8 * GRACE_S)
         now_s = run(load, 0.9 * STANDING_S, now_s, 0.01)
-    assert load.budget() == LONGER
+    assert load.budget() == Budget(room=MAX_WAITING)
 
 
 def test_an_ingest_that_is_late_makes_fewer_batches_then_looks_at_fewer_rows() -> None:
@@ -178,16 +180,17 @@ def test_health_tells_the_share_of_the_period_and_raises_an_alarm_while_it_is_sm
 def test_a_target_of_zero_sheds_nothing() -> None:
     load = LoadShedder(0.0)
     load.note_workers(100.0, 1000, 0.0)
+    load.note_unanswered(100.0, 0.0)
     assert load.takes_packet(100.0, 0.0)
     assert load.budget() == Budget()
-    assert load.gauges()["batch.shortest_ms"] == 0.0
+    assert load.gauges()["batches.spaced"] == 0.0
 
 
 # --- the stage keeps to it
 
 
-def handled(budget: Budget) -> tuple[IngestStage, list[object]]:
-    ingest = IngestStage(settings(), calibration())
+def handled(budget: Budget, chosen: Settings | None = None) -> tuple[IngestStage, list[object]]:
+    ingest = IngestStage(chosen or settings(), calibration())
     ingest.budget = budget
     e = edges(seconds=0.1)
     out = [
@@ -213,15 +216,21 @@ def test_batches_beyond_the_budget_have_no_number_and_the_optimizer_is_told_to_g
     assert (last.batch_seq, last.batch_t_ns, last.event_t_ns) == (1, everything[1].t_ns, everything[-1].t_ns)
 
 
-def test_no_batch_ends_by_its_count_sooner_than_the_budget_allows_but_its_period_stands() -> None:
-    """The edges here reach the count of 500 events in 3 to 4 ms; the period is 10 ms."""
-    natural, longer, period = (
-        np.diff([b.t_ns for b in event_batches(handled(Budget(shortest_ns=ns))[1])])
-        for ns in (0, 6_000_000, 50_000_000)
-    )
-    assert len(natural) > 20 and natural.max() < 6_000_000
-    assert set(longer) == {6_000_000}
-    assert set(period) == {10_000_000}
+@pytest.mark.parametrize("output_hz", [75.0, 200.0, 30.0])
+def test_spaced_batches_end_with_outputs_or_evenly_between_and_their_period_stands(output_hz: float) -> None:
+    """The edges here reach the count of 500 events in 3 to 4 ms."""
+
+    def ends_ns(budget: Budget, period_ms: float) -> list[int]:
+        tree = {"ingest": {"count": 500, "quota": 50, "period_ms": period_ms}, "optimizer": {"output_hz": output_hz}}
+        return [b.t_ns for b in event_batches(handled(budget, from_tree(tree))[1])]
+
+    natural, spaced = ends_ns(Budget(), 20.0), ends_ns(Budget(spaced=True), 20.0)
+    hz = {75.0: 75.0, 200.0: 200.0 / 3.0, 30.0: 60.0}[output_hz]
+    assert np.diff(natural).max() < 0.5 * NS_PER_S / hz
+    assert np.diff(spaced) == pytest.approx(NS_PER_S / hz, abs=2.0)
+    outputs = [tick_ns(tick_after(t_ns - 1, output_hz), output_hz) for t_ns in spaced]
+    assert np.mean([a == b for a, b in zip(outputs, spaced, strict=True)]) >= (0.4 if output_hz < 75.0 else 1.0)
+    assert np.diff(ends_ns(Budget(spaced=True), 10.0)).max() == 10_000_000
 
 
 def test_a_share_of_the_batches_is_spread_evenly() -> None:

@@ -106,6 +106,20 @@ def test_nonsense_sizes_are_refused(window: int, capacity: int, timeout_s: float
         Dispatcher(window, capacity, timeout_s)
 
 
+def test_the_oldest_batch_without_an_answer_is_known_wherever_it_is() -> None:
+    d: Dispatcher[str] = Dispatcher(window=1)
+    assert d.unanswered_s(5.0) == 0.0
+    d.submit(0, "0", 1.0)
+    assert d.unanswered_s(1.5) == pytest.approx(0.5), "it waits for a worker"
+    d.join("flow-0", 1.5)
+    d.submit(1, "1", 2.0)
+    assert d.unanswered_s(2.25) == pytest.approx(0.75), "since it was sent; the other waits for a shorter time"
+    d.done("flow-0", 0, 2.5)
+    assert d.unanswered_s(2.75) == pytest.approx(0.25)
+    d.done("flow-0", 1, 3.0)
+    assert d.unanswered_s(9.0) == 0.0
+
+
 def test_a_new_batch_waits_for_the_queue_or_for_the_least_loaded_worker() -> None:
     d: Dispatcher[str] = Dispatcher(window=1)
     d.join("flow-0", 0.0)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from velod.config import IngestSettings
+from velod.ingest.budget import MOST_HZ
+from velod.ticks import spaced_tick_ns
 from velod.types import I64
 
 IDLE_NS = 1_000_000_000
@@ -13,11 +15,12 @@ class OpenBatch:
     """The half-open interval [t_start_ns, t_end_ns) being filled; its end depends on the events alone.
 
     'count': just after the count-th event, so that events of one time never part; 'time': at the next whole multiple
-    of the period in sensor time; 'first': the count, but at most a period after the start. A count that is reached
-    earlier than the budget allows waits until then.
+    of the period in sensor time; 'first': the count, but at most a period after the start. Where batches are
+    spaced, one whose count is reached goes on to the next of their times.
     """
 
-    def __init__(self, settings: IngestSettings) -> None:
+    def __init__(self, settings: IngestSettings, output_hz: float) -> None:
+        self._output_hz = output_hz
         self._mode = settings.batch
         self._count = settings.count
         self._period_ns = round(settings.period_ms * 1e6)
@@ -26,18 +29,17 @@ class OpenBatch:
         self.n = 0  # events entered
         self._last_event_ns = 0
 
-    def find_end(self, queued_t_ns: I64, watermark_ns: int, shortest_ns: int = 0) -> None:
-        """Set ``t_end_ns`` once the queued left events and their watermark leave no other.
-
-        By its count a batch does not end sooner than ``shortest_ns`` after its start.
-        """
+    def find_end(self, queued_t_ns: I64, watermark_ns: int, spaced: bool = False) -> None:
+        """Set ``t_end_ns`` once the queued left events and their watermark leave no other."""
         if self.t_start_ns is None and len(queued_t_ns):
             self.t_start_ns = int(queued_t_ns[0])
         if self.t_end_ns is not None or self.t_start_ns is None:
             return
         limit = self._time_limit(self.t_start_ns)
         if self._mode != "time" and self.n + len(queued_t_ns) >= self._count:
-            end = max(int(queued_t_ns[self._count - self.n - 1]) + 1, self.t_start_ns + shortest_ns)
+            end = int(queued_t_ns[self._count - self.n - 1]) + 1
+            if spaced:
+                end = spaced_tick_ns(end, self._output_hz, MOST_HZ)
             if limit is None or end <= limit:
                 self.t_end_ns = end
                 return

@@ -5,6 +5,8 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 
+MOST_HZ = 75.0
+"""More batches than outputs make no output newer; one that ends with an output is in it at once."""
 BAND_ROWS = 64
 """Events are thinned by rows: of so many consecutive ones the first are kept, in both cameras the same.
 
@@ -23,7 +25,7 @@ class Budget:
     batches: float = 1.0  # share of the batches that are made, evenly spread
     room: int = sys.maxsize  # so many more may be made; those beyond are not
     slices: bool = True  # event by event: what is selected may go out before its batch ends
-    shortest_ns: int = 0  # sensor time; however many events there are, no batch is shorter
+    spaced: bool = False  # however many events there are, batches are no more than MOST_HZ, and end with outputs
 
     def quota(self, full: int) -> int:
         """Events that a batch may select, at least 1."""

@@ -77,7 +77,7 @@ class IngestStage:
         self._right = CameraStream(s, cal.right.width, cal.right.height, self.counters)
         self._imu = ImuStream(s, cal.time_offset_s, self.counters, self.alarms)
         self._taken = self._left.clock.new_surface()
-        self._open = OpenBatch(s)
+        self._open = OpenBatch(s, self._output_hz)
         # The paper's rules know nothing of it.
         self._time_noise = TimeNoise(self._settings.flow) if s.selection == "burst" else None
         self._batch_t_ns = NEVER
@@ -153,7 +153,7 @@ class IngestStage:
         out: list[Output] = []
         while True:
             left, right, batch = self._left, self._right, self._open
-            batch.find_end(left.queue.peek()[2], left.watermark_ns, self.budget.shortest_ns)
+            batch.find_end(left.queue.peek()[2], left.watermark_ns, self.budget.spaced)
             horizon = batch.horizon_ns(left.watermark_ns)
             out += self._enter_left(horizon)
             # Events of the right camera do not pile up while the left one is silent.

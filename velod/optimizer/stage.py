@@ -25,6 +25,7 @@ from velod.optimizer.frame import output_frame
 from velod.optimizer.inertial import continues
 from velod.optimizer.parts import Parts, batch_seq
 from velod.optimizer.rotation_check import Offsets
+from velod.ticks import tick_after, tick_ns
 from velod.types import F64, NS_PER_S, DepthBatch, FlowBatch, ImuSamples, Odometry, TrackingState, Velocity
 
 UNKNOWN_SIGMA = 100.0
@@ -187,7 +188,7 @@ class OptimizerStage:
             part = slice(first, end)
             self._estimator.add_imu(replace(m, sample_t_ns=t[part], accel=accel[part], gyro=gyro[part]))
             if self._tick == NEVER and end > first:
-                self._tick = self._tick_after(int(t[first]) - 1)
+                self._tick = tick_after(int(t[first]) - 1, self._hz)
         self._imu_t_ns = int(t[-1])
 
     def _restart_after_gap(self) -> None:
@@ -198,20 +199,11 @@ class OptimizerStage:
         self._was_valid, self._was_lost = False, self._was_valid or self._was_lost
         self._tick = NEVER
 
-    def _tick_ns(self, k: int) -> int:
-        return k * NS_PER_S // int(self._hz) if self._hz.is_integer() else int(k * (NS_PER_S / self._hz))
-
-    def _tick_after(self, t_ns: int) -> int:
-        k = int(t_ns * self._hz / NS_PER_S) - 1
-        while self._tick_ns(k) <= t_ns:
-            k += 1
-        return k
-
     def _advance(self) -> list[Velocity | Odometry]:
         """Everything that can be done now, in sensor-time order."""
         out: list[Velocity | Odometry] = []
         while self._tick != NEVER:
-            tau = self._tick_ns(self._tick)
+            tau = tick_ns(self._tick, self._hz)
             complete = self._take_in_order(tau)
             if self._imu_t_ns < tau:
                 break

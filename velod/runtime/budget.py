@@ -13,7 +13,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from velod.ingest.budget import BAND_ROWS, LEAST_ROWS, Budget
-from velod.types import NS_PER_S
 
 FALL = 0.8
 """A share is multiplied by this while something is late, once in the time that is late."""
@@ -33,10 +32,8 @@ STANDING_SELECTION = 0.5
 """... and it costs latency alone: so much less is selected at the most until it is gone."""
 HURRIED_S = 0.01
 """A batch that is not finished after so long (a worker takes half of that) shows that cores are short ..."""
-LONGER_NS = NS_PER_S // 75
-"""... and batches are no shorter than this, as more batches than outputs make no output newer ..."""
-LONGER_FOR_S = 10.0
-"""... until there has been no such batch for so long."""
+SPACED_FOR_S = 10.0
+"""... and batches are no more than outputs until there has been no such batch for so long."""
 LEAST_BATCHES = 0.1
 NO_BATCH = 2.0
 """While a batch is later than this many targets, no further one is made."""
@@ -99,7 +96,7 @@ class LoadShedder:
     _batches: Share = field(init=False)
     _rows: Share = field(init=False)
     _room: int = MAX_WAITING
-    _shortest_ns: int = 0
+    _spaced: bool = False
     _hurried_s: float = -math.inf  # when a batch last took too long
     _cuts: bool = True
     _dropping: bool = False
@@ -126,11 +123,14 @@ class LoadShedder:
 
     def note_workers(self, delay_s: float, waiting: int, now_s: float) -> None:
         """What a new batch has to wait for has been there for ``delay_s``; ``waiting`` batches have not been sent."""
-        if self.target_s and delay_s > HURRIED_S:
-            self._hurried_s = now_s
-        self._shortest_ns = LONGER_NS if now_s < self._hurried_s + LONGER_FOR_S else 0
         self._selection.note(delay_s, now_s)
         self._room = 0 if delay_s > NO_BATCH * self.target_s else max(0, MAX_WAITING - waiting)
+
+    def note_unanswered(self, delay_s: float, now_s: float) -> None:
+        """The oldest batch that no worker has finished has been there for ``delay_s``."""
+        if self.target_s and delay_s > HURRIED_S:
+            self._hurried_s = now_s
+        self._spaced = now_s < self._hurried_s + SPACED_FOR_S
 
     def note_slices(self, delay_s: float, waiting: int, now_s: float) -> None:
         """Event by event: as ``note_workers``, of a new slice. While one waits, what is selected joins the next."""
@@ -154,7 +154,7 @@ class LoadShedder:
         """What may be taken on now."""
         if not self.target_s:
             return Budget()
-        return Budget(self._share, self._rows.value, self._batches.value, self._room, self._cuts, self._shortest_ns)
+        return Budget(self._share, self._rows.value, self._batches.value, self._room, self._cuts, self._spaced)
 
     @property
     def _share(self) -> float:
@@ -176,13 +176,13 @@ class LoadShedder:
         self._made, self._selected, self._packets, self._looked_at = 0, 0.0, 0, 0.0
 
     def gauges(self) -> dict[str, float]:
-        """Shares of the period: of the selection (batches that were not made count 0), and of the events; and how
-        short batches may be now.
+        """Shares of the period: of the selection (batches that were not made count 0), and of the events; and whether
+        batches are no more than outputs.
         """
         return {
             "share.selection": self._used[0],
             "share.events": self._used[1],
-            "batch.shortest_ms": 1e-6 * self._shortest_ns,
+            "batches.spaced": float(self._spaced),
         }
 
     def alarms(self) -> dict[str, str]:

@@ -135,6 +135,14 @@ class Dispatcher(Generic[T]):
             return 0.0
         return now_s - min((sent_s for _, sent_s in self._workers[name].outstanding.values()), default=now_s)
 
+    def unanswered_s(self, now_s: float) -> float:
+        """How long the oldest batch has been there that no worker has finished; 0 where there is none."""
+        oldest_s = self._queue[0].since_s if self._queue else now_s
+        for worker in self._workers.values():
+            for _, sent_s in worker.outstanding.values():
+                oldest_s = min(oldest_s, sent_s)
+        return now_s - oldest_s
+
     def _limit_s(self, worker: str) -> float:
         others = any(name != worker and not w.silent for name, w in self._workers.items())
         return (

@@ -78,6 +78,11 @@ class BatchDispatch:
         now_s, dispatchers = time.monotonic(), [self._dispatchers[stage] for stage in stages]
         return max(d.delay_s(now_s) for d in dispatchers), max(len(d.waiting) for d in dispatchers)
 
+    def unanswered_s(self) -> float:
+        """How long the oldest batch, of either stage, has been there that no worker has finished."""
+        now_s = time.monotonic()
+        return max(dispatcher.unanswered_s(now_s) for dispatcher in self._dispatchers.values())
+
     def counters(self) -> dict[str, int]:
         """Counters of both dispatchers, ``dispatch.overflow.flow`` and so on, and of each worker, ``sent.flow-0``."""
         counted = {f"{SENT}{worker}": n for worker, n in self._sent.items()}

@@ -99,6 +99,7 @@ class IngestShell(WorkerShell):
         now_s = time.monotonic()
         if not self._load.takes_packet((time.time_ns() - item.t_ns) * 1e-9, now_s):
             return True
+        self._load.note_unanswered(self._dispatch.unanswered_s(), now_s)
         if self._by_event:
             self._load.note_slices(*self._dispatch.load("flow"), now_s)
             self._load.note_workers(*self._dispatch.load("depth"), now_s)
