@@ -296,10 +296,18 @@ def children_of(pid: int) -> set[int]:
     return {int(child) for child in text.split()}
 
 
+def is_running(pid: int) -> bool:
+    """Whether there is such a process; one that has ended stays until whoever inherited it has looked at it."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
 def are_gone(pids: set[int], within_s: float) -> bool:
     deadline_s = time.monotonic() + within_s
     while time.monotonic() < deadline_s:
-        if not any(Path(f"/proc/{pid}").exists() for pid in pids):
+        if not any(map(is_running, pids)):
             return True
         time.sleep(0.05)
     return False

@@ -233,6 +233,22 @@ def test_spaced_batches_end_with_outputs_or_evenly_between_and_their_period_stan
     assert np.diff(ends_ns(Budget(spaced=True), 10.0)).max() == 10_000_000
 
 
+@pytest.mark.parametrize("period_ms", [5.0, 10.0, 20.0])
+def test_spaced_batches_are_the_same_however_the_stream_was_cut_into_packets(period_ms: float) -> None:
+    """Some reach their count when the next of their times is after the end of their period."""
+    e, packets = edges(seconds=0.1), []
+    for seq, start_ns in enumerate(range(T0_NS, T0_NS + 100_000_000, 1_000_000)):
+        part = e[(e.t_ns >= start_ns) & (e.t_ns < start_ns + 1_000_000)]
+        packets += [part.packet(seq, start_ns + 1_000_000, camera) for camera in ("right", "left")]
+    tree = {"ingest": {"count": 500, "quota": 50, "period_ms": period_ms}}
+    whole = event_batches(handled(Budget(spaced=True), from_tree(tree))[1])
+    ingest = IngestStage(from_tree(tree), calibration())
+    ingest.budget = Budget(spaced=True)
+    cut = event_batches([out for packet in packets for out in ingest.handle(packet)])
+    assert [(b.t_ns, b.n_events) for b in cut] == [(b.t_ns, b.n_events) for b in whole[: len(cut)]]
+    assert len(whole) - len(cut) <= 1
+
+
 def test_a_share_of_the_batches_is_spread_evenly() -> None:
     everything = event_batches(handled(Budget())[1])
     made = event_batches(handled(Budget(batches=1 / 3))[1])

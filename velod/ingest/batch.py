@@ -40,9 +40,8 @@ class OpenBatch:
             end = int(queued_t_ns[self._count - self.n - 1]) + 1
             if spaced:
                 end = spaced_tick_ns(end, self._output_hz, MOST_HZ)
-            if limit is None or end <= limit:
-                self.t_end_ns = end
-                return
+            self.t_end_ns = end if limit is None else min(end, limit)
+            return
         if limit is not None and watermark_ns >= limit:
             self.t_end_ns = limit
 
